@@ -1,0 +1,1 @@
+"""Readers of scene folders, as nerfstudio dataparsers."""

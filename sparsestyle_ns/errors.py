@@ -1,0 +1,28 @@
+"""How the package speaks to the person at the keyboard when their input cannot be used."""
+
+import functools
+from typing import Callable, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class InputError(ValueError):
+    """Something the user gave cannot be used. The message is one sentence: what is wrong, where, and what to do."""
+
+
+def exit_on_input_error(function: Callable[P, R]) -> Callable[P, R]:
+    """Makes `function`, a boundary to the command line, end the process on an `InputError`.
+
+    The message goes to stderr without a traceback and the exit status is 1. Library functions raise `InputError`
+    and leave this to the classes that nerfstudio's commands call first.
+    """
+
+    @functools.wraps(function)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return function(*args, **kwargs)
+        except InputError as error:
+            raise SystemExit(f"Error: {error}") from error
+
+    return wrapper

@@ -1,0 +1,1 @@
+"""Encodings that fields are built from, as nerfstudio field components."""

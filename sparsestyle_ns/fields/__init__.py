@@ -1,0 +1,1 @@
+"""The coarse and the residual radiance field."""

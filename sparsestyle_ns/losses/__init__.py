@@ -1,0 +1,1 @@
+"""The style and content losses, one a file."""

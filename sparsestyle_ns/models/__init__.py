@@ -1,0 +1,1 @@
+"""The two methods as nerfstudio models."""

@@ -1,0 +1,1 @@
+"""What is known of the style: its image, its colours, its features."""
