@@ -1,0 +1,105 @@
+"""Finding and reading the coarse run that a stylised run builds on."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Dict, Iterable, List, Optional
+
+import torch
+import yaml
+from nerfstudio.engine.trainer import TrainerConfig
+from torch import Tensor
+
+from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
+from sparsestyle_ns.scene_record import FILE_NAME, SceneRecord
+
+
+@dataclass
+class CoarseRun:
+    """A coarse-fewshot run on disk.
+
+    Attributes:
+        folder: the run's folder.
+        config: its config.yml.
+        checkpoint: its newest checkpoint.
+    """
+
+    folder: Path
+    config: TrainerConfig
+    checkpoint: Path
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the newest checkpoint is that of the last iteration."""
+        return checkpoint_step(self.checkpoint) + 1 >= self.config.max_num_iterations
+
+    def model_state(self) -> Dict[str, Tensor]:
+        """The state of the run's model."""
+        state = torch.load(self.checkpoint, map_location="cpu", weights_only=True)["pipeline"]
+        prefix = "_model."
+        return {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
+
+
+def checkpoint_step(path: Path) -> int:
+    """The iteration in a nerfstudio checkpoint's name, step-000000123.ckpt."""
+    return int(path.stem.split("-")[1])
+
+
+def newest_checkpoint(folder: Path) -> Optional[Path]:
+    """The checkpoint of the last iteration in a folder; None where there is none."""
+    return max(folder.glob("step-*.ckpt"), key=checkpoint_step, default=None)
+
+
+def read_coarse_run(path: Path) -> CoarseRun:
+    """Reads a run given by its folder or its config.yml.
+
+    Raises:
+        InputError: it isn't there, isn't a coarse-fewshot run, or has no checkpoint.
+    """
+    folder = path.parent if path.name == "config.yml" else path
+    config_path = folder / "config.yml"
+    if not config_path.is_file():
+        raise InputError(
+            f"--coarse-run {path} has no config.yml; name the folder of a coarse-fewshot run, "
+            "such as outputs/fern/coarse-fewshot/2026-01-31_120000."
+        )
+    try:
+        config = yaml.load(config_path.read_text(), Loader=yaml.Loader)
+    except Exception as error:  # yaml builds arbitrary objects, so anything can go wrong in it
+        raise InputError(f"--coarse-run: {config_path} can't be read ({error}).") from error
+    if not isinstance(config, TrainerConfig) or not isinstance(config.pipeline.model, CoarseFewShotModelConfig):
+        method = getattr(config, "method_name", "no nerfstudio run")
+        raise InputError(f"--coarse-run {folder} is {method}; a coarse-fewshot run is needed.")
+    checkpoint = newest_checkpoint(folder / config.relative_model_dir)
+    if checkpoint is None:
+        raise InputError(f"--coarse-run {folder} has no checkpoint; train it, or name another run.")
+    return CoarseRun(folder, config, checkpoint)
+
+
+def check_scene(run: CoarseRun, scene: SceneRecord) -> None:
+    """Makes sure that a coarse run is of a scene.
+
+    Raises:
+        InputError: it is of another.
+    """
+    difference = scene.difference(SceneRecord.load(run.folder))
+    if difference is not None:
+        raise InputError(
+            f"--coarse-run {run.folder} doesn't fit {scene.data} with views {scene.view_ids}: {difference}; "
+            "name a run of this scene, or leave --coarse-run out."
+        )
+
+
+def find_coarse_run(output_dir: Path, methods: Iterable[str], scene: SceneRecord) -> Optional[CoarseRun]:
+    """The newest finished run of a scene among the runs of some methods below an output folder; None without one."""
+    found: List[CoarseRun] = []
+    for method in methods:
+        for record in output_dir.glob(f"*/{method}/*/{FILE_NAME}"):
+            try:
+                run = read_coarse_run(record.parent)
+                fits = scene.difference(SceneRecord.load(run.folder)) is None
+            except InputError:  # a damaged or unfinished neighbour is no reason to stop
+                continue
+            if fits and run.is_finished:
+                found.append(run)
+    return max(found, key=lambda run: run.checkpoint.stat().st_mtime, default=None)

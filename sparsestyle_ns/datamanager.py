@@ -1,0 +1,189 @@
+"""Photos and rays for training on a few views, whatever nerfstudio dataparser reads them."""
+
+import copy
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Dict, Literal, Optional, Tuple, Type, Union
+
+import torch
+import tyro
+from jaxtyping import Float, Int
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.utils.rich_utils import CONSOLE
+from PIL import Image
+from torch import Tensor
+
+from sparsestyle_ns.view_selection import BLENDER_VIEWS, DEFAULT_NUM_VIEWS, select_views
+
+
+@dataclass
+class FewShotDataManagerConfig(VanillaDataManagerConfig):
+    """Settings of the few-shot data manager."""
+
+    _target: Type = field(default_factory=lambda: FewShotDataManager)
+    num_views: Annotated[Optional[int], tyro.conf.arg(aliases=("--num-views",))] = None
+    """How many photos to train on, by the standard split: 3 for LLFF (RegNeRF's), 8 otherwise (for Blender's hundred,
+    DietNeRF's). Fewer are used where a scene has fewer."""
+    view_ids: Annotated[Optional[Tuple[int, ...]], tyro.conf.arg(aliases=("--view-ids",))] = None
+    """The photos to train on, by number, instead: an image's place in its sorted folder for LLFF, a frame's in
+    transforms_train.json for Blender."""
+    max_image_side: Annotated[Optional[int], tyro.conf.arg(aliases=("--max-image-side",))] = 1008
+    """Photos whose longer side is over this many pixels are reduced to it."""
+    seed: int = 42
+    """Seed of the choice of pixels; a step's batch depends on it and the step alone, so a resumed run sees the same."""
+
+
+@dataclass
+class TrainingPixels:
+    """All pixels of the training views with their rays; view i's are rows `starts[i]` to `starts[i + 1]`, row by row.
+
+    Attributes:
+        origins, directions: world rays, directions of unit length.
+        colors: in [0, 1], alpha composited on the background colour.
+        views: index of the training view.
+        starts: first row of each view, and the number of rows last.
+        sizes: (height, width) of each view.
+        trusted: rows that a mask, where there is one, leaves in.
+    """
+
+    origins: Float[Tensor, "pixels 3"]
+    directions: Float[Tensor, "pixels 3"]
+    colors: Float[Tensor, "pixels 3"]
+    views: Int[Tensor, "pixels"]
+    starts: Tuple[int, ...]
+    sizes: Tuple[Tuple[int, int], ...]
+    trusted: Int[Tensor, "trusted"]
+
+
+class FewShotDataManager(VanillaDataManager[InputDataset]):
+    """Keeps the few training views, and all their rays, in memory.
+
+    It chooses the views (`select_views`), reduces large photos, and adds to the datasets' metadata what the models need
+    to know of the scene: `space`, `background_color` and `view_ids`.
+    """
+
+    config: FewShotDataManagerConfig
+
+    def create_train_dataset(self) -> InputDataset:
+        """The dataset of the selected views only."""
+        outputs = self.train_dataparser_outputs
+        ids = outputs.metadata.get("view_ids", list(range(len(outputs.image_filenames))))
+        space = scene_space(outputs)
+        standard = BLENDER_VIEWS if isinstance(self.config.dataparser, BlenderDataParserConfig) else None
+        default = DEFAULT_NUM_VIEWS.get(space, 8)
+        if space == "ndc" and self.dataparser.config.eval_interval >= len(ids):
+            default = len(ids)
+        chosen = select_views(ids, self.config.num_views, self.config.view_ids, default, standard)
+        self.view_ids = tuple(ids[position] for position in chosen)
+        self.train_dataparser_outputs = select_outputs(outputs, chosen)
+        if self.test_mode == "val":
+            names = ", ".join(path.name for path in self.train_dataparser_outputs.image_filenames)
+            CONSOLE.print(f"Training on views {', '.join(map(str, self.view_ids))} of {len(ids)} ({names}).")
+        return self._dataset(self.train_dataparser_outputs, space)
+
+    def create_eval_dataset(self) -> InputDataset:
+        """The dataparser's whole held-out split."""
+        outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
+        return self._dataset(outputs, self.train_dataset.metadata["space"])
+
+    def _dataset(self, outputs: DataparserOutputs, space: str) -> InputDataset:
+        limit = self.config.max_image_side
+        longest = int(max(outputs.cameras.width.max(), outputs.cameras.height.max()))
+        scale = self.config.camera_res_scale_factor
+        if limit is not None and longest * scale > limit:
+            scale = limit / longest
+        dataset = self.dataset_type(dataparser_outputs=outputs, scale_factor=scale)
+        background = outputs.alpha_color
+        dataset.metadata.update(
+            space=space,
+            background_color=None if background is None or space != "box" else background.tolist(),
+            view_ids=self.view_ids,
+        )
+        return dataset
+
+    def setup_train(self) -> None:
+        """Loads the photos and generates all their rays once."""
+        self.pixels = gather_pixels(self.train_dataset, self.device)
+
+    def next_train(self, step: int) -> Tuple[RayBundle, Dict[str, Any]]:
+        """A batch of random pixels of all training views; the same for the same seed and step."""
+        self.train_count += 1
+        generator = torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + step)
+        count = self.config.train_num_rays_per_batch
+        pick = torch.randint(len(self.pixels.trusted), (count,), generator=generator, device=self.device)
+        rows = self.pixels.trusted[pick]
+        return bundle_rays(self.pixels, rows), {"image": self.pixels.colors[rows]}
+
+    def get_train_rays_per_batch(self) -> int:
+        """Rays in a batch of `next_train`."""
+        return self.config.train_num_rays_per_batch
+
+
+def scene_space(outputs: DataparserOutputs) -> Literal["ndc", "box", "contracted"]:
+    """The space a scene is laid out in: the dataparser's own word, else a box where the photos have transparency."""
+    if "space" in outputs.metadata:
+        return outputs.metadata["space"]
+    return "box" if outputs.alpha_color is not None and has_transparency(outputs.image_filenames[0]) else "contracted"
+
+
+def has_transparency(path: Path) -> bool:
+    """Whether an image has an alpha channel with anything but full opacity in it."""
+    with Image.open(path) as image:
+        return "A" in image.getbands() and image.getchannel("A").getextrema()[0] < 255
+
+
+def select_outputs(outputs: DataparserOutputs, positions: Tuple[int, ...]) -> DataparserOutputs:
+    """The same scene with only the views at these positions."""
+    index = torch.tensor(positions)
+    metadata = copy.copy(outputs.metadata)
+    for key in ("view_ids", "view_names"):
+        if key in metadata:
+            metadata[key] = [metadata[key][position] for position in positions]
+    return replace(
+        outputs,
+        image_filenames=[outputs.image_filenames[position] for position in positions],
+        mask_filenames=outputs.mask_filenames and [outputs.mask_filenames[position] for position in positions],
+        cameras=outputs.cameras[index],
+        metadata=metadata,
+    )
+
+
+def gather_pixels(dataset: InputDataset, device: Union[str, torch.device]) -> TrainingPixels:
+    """Loads all images of a dataset and generates the ray of each pixel."""
+    rays, colors, views, starts, sizes, trusted = [], [], [], [0], [], []
+    for index in range(len(dataset)):
+        data = dataset[index]
+        image = data["image"][..., :3]
+        bundle = dataset.cameras.generate_rays(camera_indices=index, keep_shape=True)
+        height, width = image.shape[:2]
+        rays.append(torch.cat([bundle.origins, bundle.directions], dim=-1).reshape(-1, 6))
+        colors.append(image.reshape(-1, 3))
+        views.append(torch.full((height * width,), index))
+        mask = data["mask"].reshape(-1) > 0.5 if "mask" in data else torch.ones(height * width, dtype=torch.bool)
+        trusted.append(mask.nonzero().squeeze(-1) + starts[-1])
+        starts.append(starts[-1] + height * width)
+        sizes.append((height, width))
+    origins, directions = torch.cat(rays).to(device).split(3, dim=-1)
+    return TrainingPixels(
+        origins=origins.contiguous(),
+        directions=directions.contiguous(),
+        colors=torch.cat(colors).to(device),
+        views=torch.cat(views).to(device),
+        starts=tuple(starts),
+        sizes=tuple(sizes),
+        trusted=torch.cat(trusted).to(device),
+    )
+
+
+def bundle_rays(pixels: TrainingPixels, rows: Int[Tensor, "rays"]) -> RayBundle:
+    """A nerfstudio ray bundle of some of the pixels."""
+    return RayBundle(
+        origins=pixels.origins[rows],
+        directions=pixels.directions[rows],
+        pixel_area=torch.ones_like(pixels.origins[rows][:, :1]),
+        camera_indices=pixels.views[rows][:, None],
+    )

@@ -1,0 +1,118 @@
+"""Multi-resolution hash grid ψ(x) (Sec. 3.1; instant-ngp, Sec. 3), split into what depends on positions and what learns.
+
+`HashGrid.locate` gives the table rows and interpolation weights of points; `HashGrid.interpolate` gathers and sums them.
+Points that stay the same from step to step are located once.
+"""
+
+from typing import NamedTuple, Tuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from nerfstudio.field_components.encodings import FieldComponent
+from torch import Tensor, nn
+
+HASH_PRIMES = (1, 2654435761, 805459861)
+"""π1, π2, π3 of the spatial hash (instant-ngp, Eq. 4)."""
+
+
+class GridLocation(NamedTuple):
+    """Where points lie in a hash grid.
+
+    Attributes:
+        indices: rows of the joined table, the eight corners of each point's cell on each level.
+        weights: trilinear weights of those corners; they sum to 1 on each level.
+    """
+
+    indices: Int[Tensor, "points levels 8"]
+    weights: Float[Tensor, "points levels 8"]
+
+    def select(self, keep: Tensor) -> "GridLocation":
+        """The location of some of the points, by mask or indices."""
+        return GridLocation(self.indices[keep], self.weights[keep])
+
+
+def grid_resolutions(num_levels: int, min_resolution: int, max_resolution: int) -> Tuple[int, ...]:
+    """N_m = ⌊N_min b^m⌋ with b = exp((ln N_max − ln N_min)/(M − 1)), m = 0 … M − 1 (Sec. 3.1).
+
+    The rounding down allows for floating-point error, so that the last level has N_max and not N_max − 1.
+    """
+    if num_levels == 1:
+        return (min_resolution,)
+    growth = (max_resolution / min_resolution) ** (1.0 / (num_levels - 1))
+    return tuple(int(min_resolution * growth**level + 1e-6) for level in range(num_levels))
+
+
+def hash_corners(corners: Int[Tensor, "*batch 3"], table_size: int) -> Int[Tensor, "*batch"]:
+    """Table rows of integer grid corners: (x π1 ⊕ y π2 ⊕ z π3) mod T (instant-ngp, Eq. 4); T a power of two."""
+    x, y, z = (corners[..., axis] * prime for axis, prime in enumerate(HASH_PRIMES))
+    return (x ^ y ^ z) & (table_size - 1)
+
+
+def locate(positions: Float[Tensor, "points 3"], resolutions: Tuple[int, ...], table_size: int) -> GridLocation:
+    """Table rows and trilinear weights of points in [0, 1]³ on each level; points outside are moved to the border.
+
+    Level m's rows start at m · T of the joined table.
+    """
+    scale = torch.tensor(resolutions, device=positions.device, dtype=positions.dtype)
+    scaled = positions.clamp(0.0, 1.0)[:, None] * scale[:, None]
+    lower = scaled.floor()
+    fraction = scaled - lower
+    offsets = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], device=positions.device)
+    corners = lower.long()[:, :, None] + offsets
+    near = torch.where(offsets.bool(), fraction[:, :, None], 1.0 - fraction[:, :, None])
+    level_start = torch.arange(len(resolutions), device=positions.device)[:, None] * table_size
+    return GridLocation(hash_corners(corners, table_size) + level_start, near.prod(dim=-1))
+
+
+def interpolate(table: Float[Tensor, "rows features"], location: GridLocation) -> Float[Tensor, "points encoded"]:
+    """Weighted sums of table rows: for each point and level, the eight corners' features; levels one after another."""
+    points, levels, corners = location.indices.shape
+    sums = F.embedding_bag(
+        location.indices.reshape(points * levels, corners),
+        table,
+        per_sample_weights=location.weights.reshape(points * levels, corners).to(table.dtype),
+        mode="sum",
+    )
+    return sums.view(points, -1)
+
+
+class HashGrid(FieldComponent):
+    """ψ(x): `num_levels` grids of features, each hashed into a table.
+
+    Args:
+        num_levels: M.
+        min_resolution: N_min, cells along the cube's side on the first level.
+        max_resolution: N_max, on the last.
+        features_per_level: length of a table row.
+        log2_table_size: log2 of the rows a level has.
+        init_scale: rows start uniform in ± this.
+    """
+
+    def __init__(
+        self,
+        num_levels: int = 8,
+        min_resolution: int = 128,
+        max_resolution: int = 512,
+        features_per_level: int = 4,
+        log2_table_size: int = 19,
+        init_scale: float = 1e-4,
+    ) -> None:
+        super().__init__(in_dim=3, out_dim=num_levels * features_per_level)
+        self.resolutions = grid_resolutions(num_levels, min_resolution, max_resolution)
+        self.table_size = 2**log2_table_size
+        table = torch.empty(num_levels * self.table_size, features_per_level)
+        self.table = nn.Parameter(table.uniform_(-init_scale, init_scale))
+
+    def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
+        """`locate` on this grid's levels; positions in [0, 1]³."""
+        return locate(positions, self.resolutions, self.table_size)
+
+    def interpolate(self, location: GridLocation) -> Float[Tensor, "points encoded"]:
+        """`interpolate` in this grid's tables."""
+        return interpolate(self.table, location)
+
+    def forward(self, in_tensor: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch encoded"]:
+        """ψ(x) at positions in [0, 1]³."""
+        flat = self.interpolate(self.locate(in_tensor.reshape(-1, 3)))
+        return flat.view(*in_tensor.shape[:-1], -1)

@@ -1,0 +1,100 @@
+"""The coarse field F_c (Eq. 1): what a scene looks like from afar, learned from three to eight photos."""
+
+from typing import Dict, Literal, Optional, Tuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from nerfstudio.cameras.rays import RaySamples
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from nerfstudio.field_components.mlp import MLP
+from nerfstudio.fields.base_field import Field
+from torch import Tensor, nn
+
+from sparsestyle_ns.field_components.positional_encoding import PositionalEncoding
+
+DensityActivation = Literal["softplus", "exp"]
+
+
+def activate_density(raw: Float[Tensor, "*batch"], activation: DensityActivation) -> Float[Tensor, "*batch"]:
+    """σ ≥ 0 from an unbounded number. `exp` is capped at e^15 so that it stays finite in float16's neighbours."""
+    if activation == "exp":
+        return torch.exp(raw.clamp(max=15.0))
+    return F.softplus(raw)
+
+
+class CoarseField(Field):
+    """(σ_c, e_c, c_c) = F_c(γ(x), d): an MLP on a low-frequency positional encoding (Eq. 1).
+
+    Args:
+        num_levels: octaves of γ(x); the paper has 7.
+        num_layers: hidden layers of the trunk; the paper has 6.
+        layer_width: units in each of them.
+        feature_dim: length of e_c, the geometric feature handed to the residual field and to the colour head.
+        direction_levels: octaves of the view direction's encoding, or None for colour that doesn't depend on it.
+        density_activation: how σ_c is kept positive.
+        density_bias: added before the activation; a negative one starts from thin fog.
+    """
+
+    def __init__(
+        self,
+        num_levels: int = 7,
+        num_layers: int = 6,
+        layer_width: int = 256,
+        feature_dim: int = 64,
+        direction_levels: Optional[int] = 4,
+        density_activation: DensityActivation = "softplus",
+        density_bias: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self.density_activation: DensityActivation = density_activation
+        self.density_bias = density_bias
+        self.feature_dim = feature_dim
+        self.position_encoding = PositionalEncoding(in_dim=3, num_levels=num_levels)
+        self.trunk = MLP(
+            in_dim=self.position_encoding.get_out_dim(),
+            num_layers=num_layers,
+            layer_width=layer_width,
+            out_dim=layer_width,
+            out_activation=nn.ReLU(),
+        )
+        self.density_head = nn.Linear(layer_width, 1)
+        self.feature_head = nn.Linear(layer_width, feature_dim)
+        self.direction_encoding = (
+            None if direction_levels is None else PositionalEncoding(in_dim=3, num_levels=direction_levels)
+        )
+        direction_dim = 0 if self.direction_encoding is None else self.direction_encoding.get_out_dim()
+        self.color_head = MLP(
+            in_dim=feature_dim + direction_dim,
+            num_layers=2,
+            layer_width=layer_width // 2,
+            out_dim=3,
+            out_activation=nn.Sigmoid(),
+        )
+
+    def density_and_feature(
+        self, positions: Float[Tensor, "*batch 3"]
+    ) -> Tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch feature"]]:
+        """σ_c and e_c at field coordinates in [−1, 1]."""
+        hidden = self.trunk(self.position_encoding(positions))
+        raw = self.density_head(hidden).squeeze(-1).float() + self.density_bias
+        return activate_density(raw, self.density_activation), self.feature_head(hidden)
+
+    def color(
+        self, feature: Float[Tensor, "*batch feature"], directions: Float[Tensor, "*batch 3"]
+    ) -> Float[Tensor, "*batch 3"]:
+        """c_c in [0, 1], from e_c and unit view directions."""
+        if self.direction_encoding is not None:
+            feature = torch.cat([feature, self.direction_encoding(directions).to(feature)], dim=-1)
+        return self.color_head(feature)
+
+    def get_density(self, ray_samples: RaySamples) -> Tuple[Tensor, Tensor]:
+        """nerfstudio's form of `density_and_feature`; the samples' positions are field coordinates."""
+        density, feature = self.density_and_feature(ray_samples.frustums.get_positions())
+        return density[..., None], feature
+
+    def get_outputs(
+        self, ray_samples: RaySamples, density_embedding: Optional[Tensor] = None
+    ) -> Dict[FieldHeadNames, Tensor]:
+        """nerfstudio's form of `color`."""
+        return {FieldHeadNames.RGB: self.color(density_embedding, ray_samples.frustums.directions)}

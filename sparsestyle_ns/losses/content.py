@@ -1,0 +1,37 @@
+"""The content loss: how far the features of a rendered view have moved from those of its photograph."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def content_loss(features: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
+    """Squared error of features, relative to the size of the target's (L_content of Eq. 5).
+
+    mean((f − f*)²) / mean(f*²): 0 for equal features, 1 for features that have all vanished.
+
+    The paper, like ARF (Sec. 4), takes the squared error alone, whose size depends on the network: two backbones
+    that see the same pictures alike, one with activations ten times as large, would differ by a factor of 100, and
+    the same λ would mean something else for each. The division takes the network's scale out. It is a constant of
+    the target, so it changes neither where the loss is least nor, for one network, any ratio of two losses.
+
+    Args:
+        features: what the rendered view gives, of any shape, `(B, C, H, W)` or `(N, C)` alike.
+        target: what the content picture gives, of the same shape. It gets no gradient. Where it is all zero there
+            is no size to divide by, and the squared error is returned as it is.
+
+    Returns:
+        A scalar, 0 or more, without a unit.
+
+    Raises:
+        ValueError: the two shapes differ, which broadcasting would otherwise hide.
+
+    Example:
+        >>> content_loss(torch.tensor([3.0, 0.0]), torch.tensor([0.0, 4.0]))
+        tensor(1.5625)
+    """
+    if features.shape != target.shape:
+        raise ValueError(f"features are {tuple(features.shape)} and the target {tuple(target.shape)}: they must agree")
+    target = target.detach()
+    size = target.square().mean()
+    return (features - target).square().mean() / torch.where(size > 0, size, torch.ones_like(size))

@@ -1,0 +1,214 @@
+"""`coarse-fewshot`: learns the coarse field of a scene from a few photos (stage 1)."""
+
+from dataclasses import dataclass, field
+from typing import Any, Dict, List, Literal, Optional, Tuple, Type
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.models.base_model import Model, ModelConfig
+from torch import Tensor
+from torch.nn import Parameter
+
+from sparsestyle_ns.evaluation.image_metrics import image_metrics
+from sparsestyle_ns.field_components.positional_encoding import revealed_levels
+from sparsestyle_ns.fields.coarse import CoarseField, DensityActivation
+from sparsestyle_ns.losses.geometry import depth_roughness, near_density
+from sparsestyle_ns.losses.reconstruction import reconstruction_loss
+from sparsestyle_ns.rendering.compositing import distortion, effective_samples
+from sparsestyle_ns.rendering.density_grid import DensityGrid
+from sparsestyle_ns.rendering.precision import Precision, autocast
+from sparsestyle_ns.rendering.sampling import even_edges
+from sparsestyle_ns.rendering.space import Segments, make_space
+from sparsestyle_ns.rendering.volume import DenseRender, render_coarse
+
+
+@dataclass
+class CoarseFieldConfig:
+    """The shape of the coarse field."""
+
+    num_levels: int = 7
+    """Octaves of the positional encoding of x."""
+    num_layers: int = 6
+    """Hidden layers."""
+    layer_width: int = 256
+    """Units in a hidden layer."""
+    feature_dim: int = 64
+    """Length of the geometric feature e_c."""
+    direction_levels: Optional[int] = 4
+    """Octaves of the view direction's encoding; None for colour that doesn't depend on the view."""
+    density_activation: DensityActivation = "exp"
+    """What keeps the density positive. exp finds surfaces sooner than softplus (README, Where the paper is silent)."""
+    density_bias: float = 0.0
+    """Added to the density's logit."""
+
+    def setup(self) -> CoarseField:
+        """The field."""
+        return CoarseField(**vars(self))
+
+
+@dataclass
+class CoarseFewShotModelConfig(ModelConfig):
+    """Settings of stage 1."""
+
+    _target: Type = field(default_factory=lambda: CoarseFewShotModel)
+    enable_collider: bool = False
+    """Unused: the space of the scene decides where rays start and end."""
+    coarse_field: CoarseFieldConfig = field(default_factory=CoarseFieldConfig)
+    """The coarse field."""
+    sampling: Literal["guided", "even"] = "guided"
+    """guided: samples go where a grid remembers density; even: evenly spaced over the ray, jittered (NeRF's first pass)."""
+    num_samples: int = 24
+    """Samples a ray in training."""
+    num_eval_samples: int = 64
+    """Samples a ray in rendering."""
+    num_bins: int = 64
+    """Bins of the histogram that guided samples follow."""
+    even_share: float = 0.1
+    """Share of guided samples, in (0, 1], that is spread evenly."""
+    grid_resolution: int = 64
+    """Cells along a side of the grid that remembers density."""
+    distortion_weight: float = 0.0
+    """Weight of the distortion loss, which gathers a ray's weight in one place; 0 is off."""
+    depth_smoothness_weight: float = 0.0
+    """Weight of the roughness of depth on patches seen from poses between the training views; 0 is off."""
+    depth_smoothness_every: int = 4
+    """Iterations from one use of the depth smoothness loss to the next."""
+    depth_smoothness_patches: int = 8
+    """Patches of 8 × 8 rays each time."""
+    occlusion_weight: float = 0.0
+    """Weight of density close to the camera (FreeNeRF's occlusion loss); 0 is off."""
+    occlusion_range: float = 0.1
+    """Part of a ray, from its start, that counts as close for the occlusion loss."""
+    frequency_reveal: float = 0.0
+    """Share of the iterations in which the encoding's octaves are revealed one by one (FreeNeRF); 0 is off."""
+    precision: Precision = "auto"
+    """Number format of matrix products: auto is bfloat16 where the device multiplies it, else float32."""
+    eval_num_rays_per_chunk: int = 8192
+    """Rays rendered at once outside of training."""
+    seed: int = 42
+    """Seed of the jitter of samples; a step's jitter depends on it and the step alone."""
+
+
+class CoarseFewShotModel(Model):
+    """The coarse field, trained on the reconstruction loss (Eq. 4) with regularisers that make it a surface."""
+
+    config: CoarseFewShotModelConfig
+
+    def populate_modules(self) -> None:
+        """Builds the field, the space and the grid that guides samples."""
+        super().populate_modules()
+        metadata: Dict[str, Any] = self.kwargs["metadata"]
+        self.space = make_space(self.scene_box, metadata)
+        self.field = self.config.coarse_field.setup()
+        self.grid = DensityGrid(self.config.grid_resolution) if self.config.sampling == "guided" else None
+        color = metadata["background_color"]
+        self.register_buffer("background", None if color is None else torch.tensor(color), persistent=False)
+        self.step = 0
+        self.num_steps = 1
+
+    def get_param_groups(self) -> Dict[str, List[Parameter]]:
+        """One group, `fields`."""
+        return {"fields": list(self.field.parameters())}
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> List[TrainingCallback]:
+        """Tells the model the step before each iteration."""
+        trainer = training_callback_attributes.trainer
+        if trainer is not None:
+            self.num_steps = trainer.config.max_num_iterations
+        return [
+            TrainingCallback(where_to_run=[TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], func=self.update_to_step)
+        ]
+
+    def update_to_step(self, step: int) -> None:
+        """Sets what depends on the iteration: the jitter and the octaves that are revealed."""
+        self.step = step
+        levels = self.config.coarse_field.num_levels
+        reveal = self.config.frequency_reveal * self.num_steps
+        self.field.position_encoding.level_weights = (
+            revealed_levels(step / reveal, levels) if self.training and step < reveal else None
+        )
+
+    def _generator(self, stream: int) -> torch.Generator:
+        seed = (self.config.seed * 1_000_003 + self.step) * 2 + stream
+        return torch.Generator(device=self.device).manual_seed(seed)
+
+    def place_samples(self, segments: Segments, num_samples: int, generator: Optional[torch.Generator]) -> Tensor:
+        """Borders of samples on rays, as the setting `sampling` says."""
+        if self.grid is None:
+            return even_edges(len(segments.hit), num_samples, self.device, generator)
+        return self.grid.place_samples(
+            segments, num_samples, self.config.num_bins, self.space.unbounded, self.config.even_share, generator
+        )
+
+    def render(
+        self, ray_bundle: RayBundle, num_samples: int, generator: Optional[torch.Generator]
+    ) -> Tuple[DenseRender, Segments, Tensor]:
+        """Renders rays; also returns their segments and the samples' borders."""
+        segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
+        edges = self.place_samples(segments, num_samples, generator)
+        with autocast(self.device, self.config.precision):
+            render = render_coarse(
+                self.field, segments, ray_bundle.directions, edges, self.space.unbounded, self.background
+            )
+        return render, segments, edges
+
+    def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
+        """`rgb`, `accumulation`, and `depth` in world units; in training also what the losses need."""
+        if not self.training:
+            render, segments, _ = self.render(ray_bundle, self.config.num_eval_samples, None)
+            depth = segments.distance(render.s.clamp(max=1.0 - 1e-4))
+            return {"rgb": render.rgb, "accumulation": render.accumulation, "depth": depth}
+        render, _, edges = self.render(ray_bundle, self.config.num_samples, self._generator(0))
+        if self.grid is not None:
+            self.grid.remember(render.positions, render.density)
+        return {
+            "rgb": render.rgb,
+            "accumulation": render.accumulation,
+            "edges": edges,
+            "weights": render.weights,
+            "density": render.density,
+        }
+
+    def get_metrics_dict(self, outputs: Dict[str, Tensor], batch: Dict[str, Any]) -> Dict[str, Tensor]:
+        """PSNR of the batch, in dB, and effective samples a ray."""
+        error = reconstruction_loss(outputs["rgb"].detach(), batch["image"].to(self.device))
+        metrics = {"psnr": -10.0 * torch.log10(error)}
+        if "weights" in outputs:
+            metrics["effective_samples"] = effective_samples(outputs["weights"].detach()).mean()
+        return metrics
+
+    def get_loss_dict(
+        self, outputs: Dict[str, Tensor], batch: Dict[str, Any], metrics_dict: Optional[Dict[str, Tensor]] = None
+    ) -> Dict[str, Tensor]:
+        """The reconstruction loss (Eq. 4) and, in training, the regularisers that are on."""
+        losses = {"reconstruction_loss": reconstruction_loss(outputs["rgb"], batch["image"].to(self.device))}
+        if not self.training:
+            return losses
+        config = self.config
+        if config.distortion_weight > 0:
+            losses["distortion_loss"] = (
+                config.distortion_weight * distortion(outputs["weights"], outputs["edges"]).mean()
+            )
+        if config.occlusion_weight > 0:
+            losses["occlusion_loss"] = config.occlusion_weight * near_density(
+                outputs["density"], outputs["edges"], config.occlusion_range
+            )
+        if "patches" in batch and config.depth_smoothness_weight > 0:
+            losses["depth_smoothness_loss"] = config.depth_smoothness_weight * self.patch_roughness(batch["patches"])
+        return losses
+
+    def patch_roughness(self, patches: RayBundle) -> Tensor:
+        """Roughness of the expected depth, as s in [0, 1], on a bundle of [patches, side, side] rays."""
+        render, _, _ = self.render(patches.flatten(), self.config.num_samples // 2, self._generator(1))
+        return depth_roughness(render.s.view(patches.shape))
+
+    def get_image_metrics_and_images(
+        self, outputs: Dict[str, Tensor], batch: Dict[str, Tensor]
+    ) -> Tuple[Dict[str, float], Dict[str, Tensor]]:
+        """PSNR, SSIM and, where its weights exist, LPIPS of a rendered view; and the pictures side by side."""
+        photo = batch["image"][..., :3].to(outputs["rgb"])
+        images = {"img": torch.cat([photo, outputs["rgb"]], dim=1)}
+        return image_metrics(outputs["rgb"], photo), images

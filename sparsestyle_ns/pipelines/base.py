@@ -1,0 +1,35 @@
+"""What the pipelines of both methods have in common."""
+
+from typing import Any, Dict
+
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+
+from sparsestyle_ns.errors import InputError, exit_on_input_error
+
+
+class CheckedPipeline(VanillaPipeline):
+    """A pipeline that ends with a clear sentence on bad input, and never loads a checkpoint in part."""
+
+    @exit_on_input_error
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+
+    @exit_on_input_error
+    def load_pipeline(self, loaded_state: Dict[str, Any], step: int) -> None:
+        """Loads a checkpoint's state.
+
+        nerfstudio would try again without strictness on a mismatch and so lose weights in silence.
+
+        Raises:
+            InputError: the checkpoint's names or shapes are not those of this pipeline.
+        """
+        expected = self.state_dict()
+        found = {key.removeprefix("module."): value for key, value in loaded_state.items()}
+        wrong = sorted(expected.keys() ^ found.keys())
+        wrong += [key for key in expected.keys() & found.keys() if expected[key].shape != found[key].shape]
+        if wrong:
+            raise InputError(
+                f"The checkpoint doesn't fit this configuration: it differs in {len(wrong)} entries, the first of "
+                f"them {wrong[0]}; load it with the config.yml of its own run."
+            )
+        super().load_pipeline(found, step)

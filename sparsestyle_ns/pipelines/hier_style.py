@@ -1,0 +1,285 @@
+"""The pipeline of `hier-style`: every iteration renders one whole view and compares it with painting and photo."""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Dict, List, Literal, Optional, Tuple, Type
+
+import psutil
+import torch
+import tyro
+from jaxtyping import Float
+from nerfstudio.cameras.camera_utils import get_interpolated_poses
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.base_datamanager import DataManagerConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.models.base_model import ModelConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import track
+from torch import Tensor
+
+from sparsestyle_ns.datamanager import FewShotDataManagerConfig
+from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.losses.reconstruction import reconstruction_loss
+from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
+from sparsestyle_ns.pipelines.base import CheckedPipeline
+from sparsestyle_ns.rendering.frozen_view import FrozenView
+from sparsestyle_ns.rendering.volume import accumulation_of
+from sparsestyle_ns.schedules import content_weight
+from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
+from sparsestyle_ns.style.image import load_style_image
+from sparsestyle_ns.style.targets import StyleTargets
+from sparsestyle_ns.style.vgg import load_backbone
+
+WARM_START_LEARNING_RATE = 5e-3
+"""That of the iterations that follow."""
+
+
+@dataclass
+class HierStylePipelineConfig(VanillaPipelineConfig):
+    """Settings of stage 2."""
+
+    _target: Type = field(default_factory=lambda: HierStylePipeline)
+    datamanager: DataManagerConfig = field(default_factory=FewShotDataManagerConfig)
+    """The photos."""
+    model: ModelConfig = field(default_factory=HierStyleModelConfig)
+    """The stylised field."""
+    style_image: Annotated[Optional[Path], tyro.conf.arg(aliases=("--style-image",))] = None
+    """The painting: a JPEG, PNG or WebP file."""
+    coarse_run: Annotated[Optional[Path], tyro.conf.arg(aliases=("--coarse-run",))] = None
+    """Folder or config.yml of the coarse-fewshot run to stylise. None: the newest finished one that matches the data
+    and its settings, and where there is none it is trained first."""
+    vgg_weights: Annotated[Optional[Path], tyro.conf.arg(aliases=("--vgg-weights",))] = None
+    """File with the weights of VGG-16. None: torchvision's, where they are cached or can be downloaded, else those in
+    the package stlpips-pytorch."""
+    backbone: Annotated[Literal["auto", "vgg16", "vgg16-shift-tolerant"], tyro.conf.arg(aliases=("--backbone",))] = (
+        "auto"
+    )
+    """Feature network; auto takes whichever of the two has weights."""
+    feature_side: int = 504
+    """Longer side, in pixels, at which the feature network sees rendered views."""
+    style_side: Optional[int] = None
+    """Longer side at which it sees the style image: smaller gives finer strokes. None: as feature_side."""
+    content_weight: float = 10.0
+    """λ0, the weight of the content loss at the start (Eq. 6)."""
+    content_decay: float = 0.01
+    """α, what is left of it in the end."""
+    content_steps: int = 100
+    """T, the iterations in which it falls."""
+    palette_transfer: bool = True
+    """Whether photos are given the painting's colours before stylising (ARF, Sec. 4)."""
+    warm_start_steps: int = 100
+    """Steps, before the first iteration, in which c_f is fitted to the photos; 0 is the paper's start from grey."""
+    warm_start_rays: int = 4096
+    """Rays a warm start step."""
+    novel_views: int = 0
+    """Views between the photos to stylise as well, with the coarse render as their content."""
+    samples_per_chunk: int = 1 << 18
+    """Samples rendered at once: memory is bounded by about 5 KB for each."""
+    cache_gigabytes: Optional[float] = None
+    """Memory for what never changes of the views; None: a quarter of what is free."""
+
+    def check_style(self) -> None:
+        """Makes sure, before hours of training, that the style image and the feature network can be loaded.
+
+        Raises:
+            InputError: they can't.
+        """
+        load_style_image(required_style_image(self))
+        load_backbone(self.backbone, self.vgg_weights)
+
+
+@dataclass
+class ContentView:
+    """A view that is stylised, and what it must stay like.
+
+    Attributes:
+        frozen: its rays, ready to render.
+        picture: its photo or coarse render, in the painting's colours where the palette is transferred.
+        features: the feature network's view of it.
+    """
+
+    frozen: FrozenView
+    picture: Float[Tensor, "H W 3"]
+    features: Float[Tensor, "1 768 h w"]
+
+
+class HierStylePipeline(CheckedPipeline):
+    """Stage 2. What only training needs, the painting and the feature network, is loaded when training is set up."""
+
+    config: HierStylePipelineConfig
+    model: HierStyleModel
+    targets: Optional[StyleTargets] = None
+    views: List[ContentView]
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> List[TrainingCallback]:
+        """Prepares the style, the views and, at the first iteration, the colours."""
+        trainer = training_callback_attributes.trainer
+        self.prepare_style()
+        self.prepare_views()
+        if trainer is not None and trainer._start_step == 0 and self.config.warm_start_steps > 0:
+            self.warm_start()
+        return super().get_training_callbacks(training_callback_attributes)
+
+    def prepare_style(self) -> None:
+        """Loads the painting and the feature network."""
+        config = self.config
+        image = load_style_image(required_style_image(config))
+        backbone = load_backbone(config.backbone, config.vgg_weights).to(self.device)
+        CONSOLE.print(f"Features: {backbone.description.name}, {backbone.description.source}")
+        self.style_image = image.to(self.device)
+        self.targets = StyleTargets(
+            backbone, self.style_image, config.feature_side, config.style_side or config.feature_side
+        )
+
+    @torch.no_grad()
+    def prepare_views(self) -> None:
+        """Freezes what never changes of each view, and computes its content features."""
+        assert self.targets is not None
+        keep_bytes = self._cache_bytes()
+        pixels = self.datamanager.pixels
+        frozen, pictures, weights = [], [], []
+        for index, (height, width) in enumerate(pixels.sizes):
+            rows = slice(pixels.starts[index], pixels.starts[index + 1])
+            view = self._freeze(pixels.origins[rows], pixels.directions[rows], keep_bytes)
+            keep_bytes -= view.kept_bytes
+            frozen.append(view)
+            pictures.append(pixels.colors[rows].view(height, width, 3))
+            weights.append(view.render(accumulation_of).view(height, width))
+        for camera in self._novel_cameras():
+            bundle = camera.generate_rays(camera_indices=0, keep_shape=True).to(self.device)
+            rays = bundle.flatten()
+            view = self._freeze(rays.origins, rays.directions, keep_bytes)
+            keep_bytes -= view.kept_bytes
+            frozen.append(view)
+            outputs = self.model.get_outputs_for_camera_ray_bundle(bundle)
+            pictures.append(outputs["rgb_coarse"])
+            weights.append(outputs["accumulation"].squeeze(-1))
+        if self.config.palette_transfer:
+            pictures = self._in_style_colors(pictures, weights)
+        self.views = [
+            ContentView(view, picture, self.targets.features(picture))
+            for view, picture in zip(frozen, pictures, strict=True)
+        ]
+        self._report_cache()
+
+    def _cache_bytes(self) -> float:
+        if self.config.cache_gigabytes is not None:
+            return self.config.cache_gigabytes * 2**30
+        free = torch.cuda.mem_get_info()[0] if self.device.type == "cuda" else psutil.virtual_memory().available
+        return free / 4
+
+    def _report_cache(self) -> None:
+        kept = sum(view.frozen.kept_bytes for view in self.views)
+        chunks = sum(view.frozen.num_chunks for view in self.views)
+        whole = sum(view.frozen.is_kept for view in self.views)
+        note = "" if whole == len(self.views) else "; the rest is computed again in each iteration"
+        CONSOLE.print(
+            f"{len(self.views)} views in {chunks} chunks, {self.model.occupancy.share:.0%} of space occupied; "
+            f"{whole} views kept in {kept / 2**20:.0f} MiB{note}."
+        )
+
+    def _freeze(self, origins: Tensor, directions: Tensor, keep_bytes: float) -> FrozenView:
+        return self.model.freeze_view(origins, directions, self.config.samples_per_chunk, keep_bytes)
+
+    def _novel_cameras(self) -> List[Cameras]:
+        """Cameras half way, a third of the way … between neighbouring training views."""
+        cameras = self.datamanager.train_dataset.cameras
+        if self.config.novel_views == 0 or len(cameras) < 2:
+            return []
+        gaps = len(cameras) - 1
+        steps = math.ceil(self.config.novel_views / gaps)
+        novel = []
+        for first in range(gaps):
+            poses = get_interpolated_poses(
+                cameras.camera_to_worlds[first].cpu().numpy(),
+                cameras.camera_to_worlds[first + 1].cpu().numpy(),
+                steps + 2,
+            )
+            novel += [cameras.camera_to_worlds.new_tensor(pose) for pose in poses[1:-1]]
+        return [
+            Cameras(
+                camera_to_worlds=pose[None, :3],
+                fx=cameras.fx[:1],
+                fy=cameras.fy[:1],
+                cx=cameras.cx[:1],
+                cy=cameras.cy[:1],
+                width=cameras.width[:1],
+                height=cameras.height[:1],
+            )
+            for pose in novel[: self.config.novel_views]
+        ]
+
+    def _in_style_colors(self, pictures: List[Tensor], weights: List[Tensor]) -> List[Tensor]:
+        """Pictures with the painting's colours; where the scene is transparent the background stays as it is."""
+        photos = len(self.datamanager.pixels.sizes)
+        colors = torch.cat([picture.reshape(-1, 3) for picture in pictures[:photos]])
+        weight = torch.cat([weight.reshape(-1) for weight in weights[:photos]])
+        style = color_moments(self.style_image.permute(1, 2, 0).reshape(-1, 3))
+        matrix, offset = palette_transform(*color_moments(colors, weight), *style)
+        transferred = [apply_palette(picture, matrix, offset, clamp=True) for picture in pictures]
+        if self.model.background is None:
+            return transferred
+        return [
+            torch.lerp(picture, changed, weight[..., None].clamp(0.0, 1.0))
+            for picture, changed, weight in zip(pictures, transferred, weights, strict=True)
+        ]
+
+    def warm_start(self) -> None:
+        """Fits c_f, on the coarse geometry, to the content pictures of the photos.
+
+        The features of VGG's third block hardly see colour; stylising from grey loses the palette. The paper doesn't do
+        this.
+        """
+        pixels = self.datamanager.pixels
+        target = torch.cat([view.picture.reshape(-1, 3) for view in self.views[: len(pixels.sizes)]])
+        optimizer = torch.optim.Adam(self.model.residual.parameters(), lr=WARM_START_LEARNING_RATE, fused=True)
+        generator = torch.Generator(device=self.device).manual_seed(self.datamanager.config.seed)
+        for _ in track(range(self.config.warm_start_steps), description="Warm start", transient=True):
+            pick = torch.randint(
+                len(pixels.trusted), (self.config.warm_start_rays,), generator=generator, device=self.device
+            )
+            rows = pixels.trusted[pick]
+            frozen = self.model.freeze(pixels.origins[rows], pixels.directions[rows])
+            loss = reconstruction_loss(self.model.stylised(frozen, coarse_geometry=True).rgb, target[rows])
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        optimizer.zero_grad()
+
+    def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Tensor], Dict[str, Tensor], Dict[str, Any]]:
+        """One whole view: λ(t) L_content and L_style (Eq. 5 and 6)."""
+        assert self.targets is not None
+        view = self.views[step % len(self.views)]
+        image = view.frozen.render(lambda chunk: self.model.stylised(chunk).rgb).view(view.picture.shape)
+        style, content = self.targets.losses(image, view.features)
+        config = self.config
+        weight = content_weight(step, config.content_weight, config.content_decay, config.content_steps)
+        metrics = {"content": content.detach(), "style": style.detach(), "lambda": weight}
+        return {"rgb": image}, {"content_loss": weight * content, "style_loss": style}, metrics
+
+    @torch.no_grad()
+    def get_eval_loss_dict(self, step: int) -> Tuple[Dict[str, Tensor], Dict[str, Tensor], Dict[str, Any]]:
+        """The same losses of one held-out view, with its photo, as it is, as content."""
+        assert self.targets is not None
+        self.eval()
+        camera, batch = self.datamanager.next_eval_image(step)
+        outputs = self.model.get_outputs_for_camera(camera)
+        content = self.targets.features(batch["image"][..., :3].to(self.device))
+        style, content_loss = self.targets.losses(outputs["rgb"], content)
+        self.train()
+        return outputs, {"content_loss": content_loss, "style_loss": style}, {}
+
+
+def required_style_image(config: HierStylePipelineConfig) -> Path:
+    """The style image's path.
+
+    Raises:
+        InputError: none is set.
+    """
+    if config.style_image is None:
+        raise InputError("There is no style image: name a painting with --style-image FILE.")
+    return config.style_image

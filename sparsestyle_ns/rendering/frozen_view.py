@@ -1,0 +1,77 @@
+"""A whole view rendered as one differentiable image, in bounded memory.
+
+The view's rays are cut into chunks of a limited number of samples. Each chunk but a lone one is rendered under gradient
+checkpointing: its activations are computed again in the backward pass, so that the gradient equals that of rendering
+all at once while only one chunk's activations exist at a time.
+"""
+
+from typing import Callable, List, Optional
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from sparsestyle_ns.rendering.volume import FrozenSamples
+
+
+def split_by_samples(counts: Int[Tensor, "rays"], max_samples: int) -> List[slice]:
+    """Cuts rays into consecutive runs of at most `max_samples` samples; a longer single ray is a run of its own."""
+    runs, start, total = [], 0, 0
+    for ray, count in enumerate(counts.tolist()):
+        if total + count > max_samples and ray > start:
+            runs.append(slice(start, ray))
+            start, total = ray, 0
+        total += count
+    return [*runs, slice(start, len(counts))]
+
+
+class FrozenView:
+    """The rays of one view, cut into chunks, with the frozen part of each chunk's work kept or done again each time.
+
+    Args:
+        runs: the rays of each chunk.
+        freeze: gives the frozen samples of a run of rays.
+        keep_bytes: memory that kept chunks may take; chunks past it are frozen again whenever they are rendered.
+    """
+
+    def __init__(self, runs: List[slice], freeze: Callable[[slice], FrozenSamples], keep_bytes: float) -> None:
+        self.runs = runs
+        self.freeze = freeze
+        self.kept: List[Optional[FrozenSamples]] = []
+        self.kept_bytes = 0
+        for run in runs:
+            frozen = freeze(run) if self.kept_bytes < keep_bytes else None
+            if frozen is not None and self.kept_bytes + frozen.num_bytes <= keep_bytes:
+                self.kept_bytes += frozen.num_bytes
+                self.kept.append(frozen)
+            else:
+                keep_bytes = 0
+                self.kept.append(None)
+
+    @property
+    def num_chunks(self) -> int:
+        """Chunks the view is cut into."""
+        return len(self.runs)
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether all of the view's frozen samples are kept."""
+        return all(chunk is not None for chunk in self.kept)
+
+    def chunk(self, index: int) -> FrozenSamples:
+        """The frozen samples of a chunk."""
+        kept = self.kept[index]
+        return self.freeze(self.runs[index]) if kept is None else kept
+
+    def render(self, render_chunk: Callable[[FrozenSamples], Float[Tensor, "rays channels"]]) -> Tensor:
+        """Pixels of the view, [rays, channels], differentiable in whatever `render_chunk` learns."""
+
+        def run(index: int) -> Tensor:
+            return render_chunk(self.chunk(index))
+
+        if self.num_chunks == 1 or not torch.is_grad_enabled():
+            return torch.cat([run(index) for index in range(self.num_chunks)])
+        return torch.cat(
+            [checkpoint(run, index, use_reentrant=False, preserve_rng_state=False) for index in range(self.num_chunks)]
+        )

@@ -1,0 +1,263 @@
+"""Which part of space a scene lies in, and how it is laid into the cube [−1, 1]³ that the fields live in.
+
+Three spaces cover the scenes that nerfstudio's dataparsers give: *forward-facing* (NDC: everything from a near plane to
+infinity), *box* (an object in an axis-aligned box) and *contracted* (cameras all around, background at any distance).
+A space turns rays into segments; s in [0, 1] goes from a segment's start to its end. Density is per unit of length in
+the cube, so that the scale of the world's coordinates doesn't matter.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Dict, Optional, Tuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from nerfstudio.data.scene_box import SceneBox
+from torch import Tensor, nn
+
+from sparsestyle_ns.rendering.ndc import ndc_distance, ndc_rays
+
+MAX_DISTANCE = 1e4
+"""The distance, in world units, that stands for infinity in depth maps."""
+
+
+class Segments(ABC):
+    """The parts of a batch of rays that lie in the scene. Rays that miss it have length 0 and `hit` false."""
+
+    hit: Bool[Tensor, "rays"]
+
+    @abstractmethod
+    def positions(
+        self, s: Float[Tensor, "..."], ray_indices: Optional[Int[Tensor, "samples"]] = None
+    ) -> Float[Tensor, "... 3"]:
+        """Field coordinates at s: [rays, samples] on all rays, or [samples] on the rays `ray_indices`."""
+
+    @abstractmethod
+    def lengths(self, edges: Float[Tensor, "rays edges"]) -> Float[Tensor, "rays samples"]:
+        """Length in field coordinates between neighbouring borders."""
+
+    @abstractmethod
+    def distance(self, s: Float[Tensor, "rays 1"]) -> Float[Tensor, "rays 1"]:
+        """Distance from the ray's origin in world units, at most `MAX_DISTANCE`."""
+
+
+@dataclass
+class LinearSegments(Segments):
+    """Segments that are straight in field coordinates: start + s · extent."""
+
+    start: Float[Tensor, "rays 3"]
+    extent: Float[Tensor, "rays 3"]
+    hit: Bool[Tensor, "rays"]
+
+    def positions(self, s: Tensor, ray_indices: Optional[Tensor] = None) -> Tensor:
+        """See `Segments.positions`."""
+        if ray_indices is None:
+            return self.start[:, None] + s[..., None] * self.extent[:, None]
+        return self.start[ray_indices] + s[:, None] * self.extent[ray_indices]
+
+    def lengths(self, edges: Tensor) -> Tensor:
+        """See `Segments.lengths`."""
+        return (edges[:, 1:] - edges[:, :-1]) * self.extent.norm(dim=-1, keepdim=True)
+
+
+@dataclass
+class ForwardFacingSegments(LinearSegments):
+    """Linear segments in NDC, with the world rays they came from."""
+
+    origins: Float[Tensor, "rays 3"]
+    directions: Float[Tensor, "rays 3"]
+    near: float
+
+    def distance(self, s: Tensor) -> Tensor:
+        """See `Segments.distance`."""
+        return ndc_distance(s, self.origins, self.directions, self.near, max_distance=MAX_DISTANCE).clamp(
+            max=MAX_DISTANCE
+        )
+
+
+@dataclass
+class BoxSegments(LinearSegments):
+    """Linear segments in a box, entered at distance `near` and left at `far`."""
+
+    near: Float[Tensor, "rays 1"]
+    far: Float[Tensor, "rays 1"]
+
+    def distance(self, s: Tensor) -> Tensor:
+        """See `Segments.distance`."""
+        return self.near + s * (self.far - self.near)
+
+
+@dataclass
+class ContractedSegments(Segments):
+    """Segments of world rays, bent by the contraction; s is linear up to distance 1 and in disparity beyond."""
+
+    origins: Float[Tensor, "rays 3"]
+    directions: Float[Tensor, "rays 3"]
+    near: float
+    hit: Bool[Tensor, "rays"]
+
+    def distance(self, s: Tensor) -> Tensor:
+        """See `Segments.distance`."""
+        start = spacing(torch.tensor(self.near))
+        end = spacing(torch.tensor(MAX_DISTANCE))
+        return inverse_spacing(start.to(s) + s * (end - start).to(s))
+
+    def positions(self, s: Tensor, ray_indices: Optional[Tensor] = None) -> Tensor:
+        """See `Segments.positions`."""
+        if ray_indices is None:
+            points = self.origins[:, None] + self.distance(s)[..., None] * self.directions[:, None]
+        else:
+            points = self.origins[ray_indices] + self.distance(s)[:, None] * self.directions[ray_indices]
+        return contract(points)
+
+    def lengths(self, edges: Tensor) -> Tensor:
+        """See `Segments.lengths`; chords of the bent ray."""
+        points = self.positions(edges)
+        return (points[:, 1:] - points[:, :-1]).norm(dim=-1)
+
+
+def spacing(distance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """g(t) = t/2 up to t = 1, then 1 − 1/(2t): even steps in g are even in distance near by, in disparity far away."""
+    return torch.where(distance < 1.0, 0.5 * distance, 1.0 - 0.5 / distance.clamp(min=1.0))
+
+
+def inverse_spacing(spaced: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The inverse of `spacing`, at most `MAX_DISTANCE`."""
+    return torch.where(spaced < 0.5, 2.0 * spaced, 0.5 / (1.0 - spaced).clamp(min=0.5 / MAX_DISTANCE))
+
+
+def contract(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """World points into [−1, 1]³: x/2 within the unit cube, (2 − 1/|x|) x/(2|x|) outside, |·| the largest coordinate.
+
+    It is the contraction of mip-NeRF 360 (Eq. 10) with the maximum norm, halved.
+    """
+    norm = points.abs().amax(dim=-1, keepdim=True)
+    outside = (2.0 - 1.0 / norm.clamp(min=1.0)) * points / norm.clamp(min=1.0)
+    return 0.5 * torch.where(norm < 1.0, points, outside)
+
+
+def intersect_box(
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    minimum: Float[Tensor, "3"],
+    maximum: Float[Tensor, "3"],
+    near: float = 0.0,
+) -> Tuple[Float[Tensor, "rays 1"], Float[Tensor, "rays 1"], Bool[Tensor, "rays"]]:
+    """Distances at which rays enter and leave an axis-aligned box (the slab method).
+
+    Args:
+        near: rays start no closer than this, so that a camera may stand in the box.
+
+    Returns:
+        Entry and exit distance, and whether the ray meets the box. Where it doesn't, both distances are `near`.
+    """
+    tiny = torch.finfo(directions.dtype).tiny
+    safe = torch.where(directions.abs() < tiny, torch.full_like(directions, tiny), directions)
+    to_minimum, to_maximum = (minimum - origins) / safe, (maximum - origins) / safe
+    entry = torch.minimum(to_minimum, to_maximum).amax(dim=-1, keepdim=True).clamp(min=near)
+    leave = torch.maximum(to_minimum, to_maximum).amin(dim=-1, keepdim=True)
+    hit = leave > entry
+    start = torch.full_like(entry, near)
+    return torch.where(hit, entry, start), torch.where(hit, leave, start), hit.squeeze(-1)
+
+
+class Space(nn.Module, ABC):
+    """A map from world rays to segments in field coordinates."""
+
+    unbounded: bool
+    """Whether a segment's last interval goes on to infinity."""
+
+    @abstractmethod
+    def segments(self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]) -> Segments:
+        """The parts of world rays (unit directions) that lie in the scene."""
+
+
+class ForwardFacingSpace(Space):
+    """Normalised device coordinates (NeRF, appendix C), for cameras that all look one way.
+
+    Args:
+        box: NDC box that holds all views' frusta; it becomes the cube.
+        focal_over_half_size: 2f/width and 2f/height.
+        near: distance of the near plane in world units.
+    """
+
+    unbounded = True
+
+    def __init__(self, box: SceneBox, focal_over_half_size: Tuple[float, float], near: float) -> None:
+        super().__init__()
+        self.register_buffer("minimum", box.aabb[0].float().clone())
+        self.register_buffer("maximum", box.aabb[1].float().clone())
+        self.focal_over_half_size = focal_over_half_size
+        self.near = near
+
+    def segments(self, origins: Tensor, directions: Tensor) -> ForwardFacingSegments:
+        """See `Space.segments`."""
+        start, extent, valid = ndc_rays(origins, directions, self.focal_over_half_size, self.near)
+        hit = valid.squeeze(-1)
+        scale = 2.0 / (self.maximum - self.minimum)
+        return ForwardFacingSegments(
+            start=(start - self.minimum) * scale - 1.0,
+            extent=extent * scale * hit[:, None],
+            hit=hit,
+            origins=origins,
+            directions=directions,
+            near=self.near,
+        )
+
+
+class BoxSpace(Space):
+    """An axis-aligned box in world coordinates, for an object with nothing behind it.
+
+    Args:
+        box: the box; its longest side becomes the cube's.
+        near: rays start no closer to the camera than this.
+    """
+
+    unbounded = False
+
+    def __init__(self, box: SceneBox, near: float = 0.05) -> None:
+        super().__init__()
+        self.register_buffer("minimum", box.aabb[0].float().clone())
+        self.register_buffer("maximum", box.aabb[1].float().clone())
+        self.near = near
+
+    def segments(self, origins: Tensor, directions: Tensor) -> BoxSegments:
+        """See `Space.segments`."""
+        near, far, hit = intersect_box(origins, directions, self.minimum, self.maximum, self.near)
+        center = 0.5 * (self.minimum + self.maximum)
+        scale = 2.0 / (self.maximum - self.minimum).amax()
+        return BoxSegments(
+            start=(origins + near * directions - center) * scale,
+            extent=(far - near) * directions * scale,
+            hit=hit,
+            near=near,
+            far=far,
+        )
+
+
+class ContractedSpace(Space):
+    """All of space, contracted, for cameras all around and a background beyond them.
+
+    Args:
+        near: distance at which rays start, in world units.
+    """
+
+    unbounded = True
+
+    def __init__(self, near: float = 0.05) -> None:
+        super().__init__()
+        self.near = near
+
+    def segments(self, origins: Tensor, directions: Tensor) -> ContractedSegments:
+        """See `Space.segments`."""
+        hit = torch.ones(len(origins), dtype=torch.bool, device=origins.device)
+        return ContractedSegments(origins=origins, directions=directions, near=self.near, hit=hit)
+
+
+def make_space(scene_box: SceneBox, metadata: Dict[str, Any]) -> Space:
+    """The space that a dataset's metadata asks for: its key `space` is "ndc", "box" or "contracted"."""
+    if metadata["space"] == "ndc":
+        return ForwardFacingSpace(scene_box, tuple(metadata["ndc_focal_over_half_size"]), metadata["ndc_near"])
+    if metadata["space"] == "box":
+        return BoxSpace(scene_box)
+    return ContractedSpace()

@@ -1,0 +1,193 @@
+"""Volume rendering of the two fields: segments and fields in, pixels out."""
+
+from dataclasses import dataclass
+from typing import Optional
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestyle_ns.field_components.hash_grid import GridLocation
+from sparsestyle_ns.fields.coarse import CoarseField
+from sparsestyle_ns.fields.residual import ResidualField
+from sparsestyle_ns.rendering.compositing import (
+    dense_weights,
+    optical_depth,
+    packed_sum,
+    packed_transmittance,
+    packed_weights,
+)
+from sparsestyle_ns.rendering.density_grid import Occupancy, PackedSamples, interval_lengths, march
+from sparsestyle_ns.rendering.space import Segments
+
+
+@dataclass
+class DenseRender:
+    """What `render_coarse` finds on each ray.
+
+    Attributes:
+        rgb: colour, background included.
+        accumulation: Σw, the share of the ray that is not background.
+        s: where the ray's weight lies on average, in [0, 1].
+        weights: w of each sample.
+        density: σ of each sample.
+        positions: field coordinates of each sample.
+    """
+
+    rgb: Float[Tensor, "rays 3"]
+    accumulation: Float[Tensor, "rays 1"]
+    s: Float[Tensor, "rays 1"]
+    weights: Float[Tensor, "rays samples"]
+    density: Float[Tensor, "rays samples"]
+    positions: Float[Tensor, "rays samples 3"]
+
+
+POINTS_PER_CALL = 1 << 17
+"""Points at which a frozen field is evaluated at once; bounds the memory of its hidden layers."""
+
+
+def over_background(
+    rgb: Float[Tensor, "rays 3"], accumulation: Float[Tensor, "rays 1"], background: Optional[Float[Tensor, "3"]]
+) -> Float[Tensor, "rays 3"]:
+    """Colour in front of a background colour; unchanged where there is none."""
+    return rgb if background is None else rgb + (1.0 - accumulation) * background
+
+
+def mean_position(weights: Float[Tensor, "rays samples"], s: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays 1"]:
+    """Σ w s / Σ w; 1, the segment's end, where a ray has no weight."""
+    total = weights.sum(dim=-1, keepdim=True)
+    return torch.where(total > 0, (weights * s).sum(dim=-1, keepdim=True) / total.clamp(min=1e-10), 1.0)
+
+
+def render_coarse(
+    field: CoarseField,
+    segments: Segments,
+    directions: Float[Tensor, "rays 3"],
+    edges: Float[Tensor, "rays edges"],
+    unbounded: bool,
+    background: Optional[Float[Tensor, "3"]],
+) -> DenseRender:
+    """Renders the coarse field with the samples that `edges` bound (Eq. 1; NeRF, Eq. 3)."""
+    middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+    positions = segments.positions(middle)
+    density, feature = field.density_and_feature(positions)
+    color = field.color(feature, directions[:, None].expand_as(positions)).float()
+    weights = dense_weights(optical_depth(density, interval_lengths(segments, edges, unbounded)))
+    accumulation = weights.sum(dim=-1, keepdim=True)
+    rgb = (weights[..., None] * color).sum(dim=-2)
+    return DenseRender(
+        rgb=over_background(rgb, accumulation, background),
+        accumulation=accumulation,
+        s=mean_position(weights, middle),
+        weights=weights,
+        density=density,
+        positions=positions,
+    )
+
+
+@dataclass
+class FrozenSamples:
+    """All that the residual field needs of a batch of rays and that training it doesn't change.
+
+    Attributes:
+        samples: where the samples are.
+        density: σ_c there.
+        feature: e_c there.
+        location: where they lie in the hash grid.
+        num_rays: of the batch.
+    """
+
+    samples: PackedSamples
+    density: Float[Tensor, "samples"]
+    feature: Float[Tensor, "samples feature"]
+    location: GridLocation
+    num_rays: int
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory that keeping these samples takes."""
+        parts = [*self.samples, self.density, self.feature, *self.location]
+        return sum(part.numel() * part.element_size() for part in parts)
+
+
+@torch.no_grad()
+def freeze_samples(
+    field: CoarseField,
+    residual: ResidualField,
+    occupancy: Occupancy,
+    segments: Segments,
+    num_steps: int,
+    unbounded: bool,
+    min_transmittance: float,
+) -> FrozenSamples:
+    """Finds the samples of a batch of rays that can show, and evaluates the frozen coarse field there.
+
+    Samples lie in occupied cells, and in front of them at least `min_transmittance` of the light is left.
+    """
+    num_rays = len(segments.hit)
+    samples = march(segments, occupancy, num_steps, unbounded)
+    parts = [field.density_and_feature(part) for part in samples.positions.split(POINTS_PER_CALL)]
+    density, feature = torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
+    depth = optical_depth(density, samples.lengths)
+    seen = packed_transmittance(depth, samples.ray_indices, num_rays) > min_transmittance
+    samples = samples.select(seen)
+    return FrozenSamples(samples, density[seen], feature[seen].float(), residual.locate(samples.positions), num_rays)
+
+
+def accumulation_of(frozen: FrozenSamples) -> Float[Tensor, "rays 1"]:
+    """Σw of the coarse field on each ray."""
+    depth = optical_depth(frozen.density, frozen.samples.lengths)
+    weights = packed_weights(depth, frozen.samples.ray_indices, frozen.num_rays)
+    return packed_sum(weights[:, None], frozen.samples.ray_indices, frozen.num_rays)
+
+
+@dataclass
+class PackedRender:
+    """What `render_stylised` finds on each ray: colour with background, Σw, and where the weight lies on average."""
+
+    rgb: Float[Tensor, "rays 3"]
+    accumulation: Float[Tensor, "rays 1"]
+    s: Float[Tensor, "rays 1"]
+
+
+def render_packed(
+    samples: PackedSamples,
+    num_rays: int,
+    density: Float[Tensor, "samples"],
+    color: Float[Tensor, "samples 3"],
+    background: Optional[Float[Tensor, "3"]],
+) -> PackedRender:
+    """Composites packed samples of known density and colour; the packed twin of `render_coarse`."""
+    weights = packed_weights(optical_depth(density, samples.lengths), samples.ray_indices, num_rays)[:, None]
+    values = torch.cat([color, torch.ones_like(weights), samples.s[:, None]], dim=-1)
+    rgb, accumulation, moment = packed_sum(weights * values, samples.ray_indices, num_rays).split([3, 1, 1], dim=-1)
+    s = torch.where(accumulation > 0, moment / accumulation.clamp(min=1e-10), 1.0)
+    return PackedRender(over_background(rgb, accumulation, background), accumulation, s)
+
+
+def render_stylised(
+    residual: ResidualField,
+    frozen: FrozenSamples,
+    background: Optional[Float[Tensor, "3"]],
+    coarse_geometry: bool = False,
+) -> PackedRender:
+    """Renders σ_f and c_f (Eq. 2 and 3) at frozen samples; differentiable in the residual field.
+
+    With `coarse_geometry`, σ_c takes the place of σ_f.
+    """
+    density, color = residual(frozen.location, frozen.feature, frozen.density)
+    if coarse_geometry:
+        density = frozen.density
+    return render_packed(frozen.samples, frozen.num_rays, density, color, background)
+
+
+@torch.no_grad()
+def render_frozen_coarse(
+    field: CoarseField,
+    frozen: FrozenSamples,
+    directions: Float[Tensor, "rays 3"],
+    background: Optional[Float[Tensor, "3"]],
+) -> PackedRender:
+    """Renders the coarse field at the same frozen samples."""
+    color = field.color(frozen.feature, directions[frozen.samples.ray_indices]).float()
+    return render_packed(frozen.samples, frozen.num_rays, frozen.density, color, background)

@@ -1,0 +1,78 @@
+"""What a run was trained on, saved beside its config, so that a later run can tell whether it fits."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import List, Optional
+
+import numpy as np
+
+from sparsestyle_ns.datamanager import FewShotDataManager
+from sparsestyle_ns.errors import InputError
+
+FILE_NAME = "scene.json"
+
+
+@dataclass
+class SceneRecord:
+    """The photos of a run.
+
+    Attributes:
+        data: folder or file of the scene, absolute.
+        view_ids: the training views' ids.
+        view_names: their file names.
+        space: how space is laid out (`rendering.space`).
+        background_color: RGB behind the scene, or None.
+        scene_box: corners of the scene's box.
+        cameras: camera-to-world matrix, [3][4], of each training view, after the dataparser's scaling.
+    """
+
+    data: str
+    view_ids: List[int]
+    view_names: List[str]
+    space: str
+    background_color: Optional[List[float]]
+    scene_box: List[List[float]]
+    cameras: List[List[List[float]]]
+
+    def save(self, folder: Path) -> None:
+        """Writes `scene.json` into a run's folder."""
+        (folder / FILE_NAME).write_text(json.dumps(asdict(self), indent=1) + "\n")
+
+    @classmethod
+    def load(cls, folder: Path) -> "SceneRecord":
+        """Reads `scene.json` of a run's folder.
+
+        Raises:
+            InputError: there is none, or it can't be read.
+        """
+        path = folder / FILE_NAME
+        try:
+            return cls(**json.loads(path.read_text()))
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(f"{path} is missing or damaged; is {folder} the folder of a finished run?") from error
+
+    def difference(self, other: "SceneRecord") -> Optional[str]:
+        """In words, what keeps a field trained on `other` from fitting this scene; None where nothing does."""
+        if self.view_ids != other.view_ids or self.view_names != other.view_names:
+            return f"it was trained on views {other.view_ids} ({', '.join(other.view_names)})"
+        if self.space != other.space or self.background_color != other.background_color:
+            return f"it lays the scene out as {other.space} with background {other.background_color}"
+        mine, theirs = self.cameras + [self.scene_box], other.cameras + [other.scene_box]
+        if any(not np.allclose(first, second, atol=1e-4) for first, second in zip(mine, theirs, strict=True)):
+            return "its cameras stand elsewhere: another scene, or other settings of the dataparser"
+        return None
+
+
+def record_scene(datamanager: FewShotDataManager) -> SceneRecord:
+    """The record of a data manager's training views."""
+    dataset = datamanager.train_dataset
+    return SceneRecord(
+        data=str(Path(datamanager.config.data).resolve()),
+        view_ids=list(datamanager.view_ids),
+        view_names=[path.name for path in dataset._dataparser_outputs.image_filenames],
+        space=dataset.metadata["space"],
+        background_color=dataset.metadata["background_color"],
+        scene_box=dataset.scene_box.aabb.tolist(),
+        cameras=dataset.cameras.camera_to_worlds.tolist(),
+    )

@@ -1,0 +1,94 @@
+"""Palette transfer: the affine map of colours that gives a scene the mean and covariance of a painting's colours.
+
+Letters, as in ARF: μ is a mean colour and Σ a covariance of colours; the subscript c stands for content, s for style.
+"""
+
+from typing import Optional
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestyle_ns.errors import InputError
+
+SMALLEST_SPREAD = 1 / 255
+"""Standard deviation, in units of the colour range, below which a direction counts as a rounding error."""
+
+
+def color_moments(
+    colors: Float[Tensor, "*batch 3"], weights: Optional[Float[Tensor, "*batch"]] = None
+) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
+    """Mean and covariance of colours.
+
+    μ = Σ_i w_i c_i / Σ_i w_i and Σ = Σ_i w_i (c_i − μ)(c_i − μ)ᵀ / Σ_i w_i, computed and returned in float64.
+
+    Args:
+        colors: RGB in the last dimension, usually in [0, 1].
+        weights: how much each colour counts, 0 or more; all alike where left out.
+
+    Raises:
+        InputError: there are no colours, or no weight is positive.
+    """
+    points = colors.reshape(-1, 3).double()
+    weight = torch.ones_like(points[:, :1]) if weights is None else weights.reshape(-1, 1).double()
+    total = weight.sum()
+    if not total > 0:
+        raise InputError("There is no colour to take a palette from: give an image in which some pixel counts.")
+    mean = (weight * points).sum(dim=0) / total
+    centred = points - mean
+    return mean, (weight * centred).T @ centred / total
+
+
+def palette_transform(
+    content_mean: Float[Tensor, "3"],
+    content_covariance: Float[Tensor, "3 3"],
+    style_mean: Float[Tensor, "3"],
+    style_covariance: Float[Tensor, "3 3"],
+) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
+    """The map c ↦ A c + b that gives the content's colours the style's mean and covariance.
+
+    A = Σ_s^½ Σ_c^−½ with symmetric square roots and b = μ_s − A μ_c (ARF, Sec. 4).
+
+    A photograph without colour, or of one colour, has a singular Σ_c, whose inverse would turn rounding errors into
+    paint. Along an eigenvector of Σ_c with a standard deviation σ of at least `SMALLEST_SPREAD` the gain is the exact
+    1/σ; below, it falls in proportion to σ, from 1/`SMALLEST_SPREAD` to 0. The map is continuous in its arguments,
+    its gain is bounded, and directions in which the content has no variance are mapped to the style's mean.
+
+    Args:
+        content_mean: μ_c.
+        content_covariance: Σ_c, symmetric, of colours in [0, 1].
+        style_mean: μ_s.
+        style_covariance: Σ_s, symmetric, of colours in [0, 1].
+
+    Returns:
+        A and b, in float64.
+    """
+    variances, axes = torch.linalg.eigh(content_covariance.double())
+    spreads = variances.clamp_min(0).sqrt()
+    gains = torch.where(spreads >= SMALLEST_SPREAD, 1 / spreads, spreads / SMALLEST_SPREAD**2)
+    whitening = (axes * gains) @ axes.T
+
+    variances, axes = torch.linalg.eigh(style_covariance.double())
+    coloring = (axes * variances.clamp_min(0).sqrt()) @ axes.T
+
+    matrix = coloring @ whitening
+    return matrix, style_mean.double() - matrix @ content_mean.double()
+
+
+def apply_palette(
+    colors: Float[Tensor, "*batch 3"],
+    matrix: Float[Tensor, "3 3"],
+    offset: Float[Tensor, "3"],
+    clamp: bool = False,
+) -> Float[Tensor, "*batch 3"]:
+    """A c + b for every colour, in the colours' own dtype and on their device.
+
+    Args:
+        colors: RGB in the last dimension.
+        matrix: A of `palette_transform`.
+        offset: b of `palette_transform`.
+        clamp: whether to cut the result to [0, 1]. Left as it is, it has the style's exact mean and covariance, but
+            may leave the range of colours a screen can show.
+    """
+    transferred = colors @ matrix.to(colors).T + offset.to(colors)
+    return transferred.clamp(0, 1) if clamp else transferred

@@ -1,0 +1,60 @@
+"""What a stylised view is compared with: features of the style image and of the content picture of each view."""
+
+from typing import Tuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestyle_ns.losses.content import content_loss
+from sparsestyle_ns.losses.nnfm import nnfm_loss
+from sparsestyle_ns.style.vgg import VGGFeatures
+
+
+def fit_side(image: Float[Tensor, "B C H W"], longer_side: int) -> Float[Tensor, "B C h w"]:
+    """An image enlarged or reduced (bilinear, antialiased) so that its longer side has this many pixels."""
+    height, width = image.shape[-2:]
+    scale = longer_side / max(height, width)
+    if scale == 1.0:
+        return image
+    size = (max(8, round(height * scale)), max(8, round(width * scale)))
+    return F.interpolate(image, size=size, mode="bilinear", antialias=True, align_corners=False)
+
+
+def feature_rows(features: Float[Tensor, "B C h w"]) -> Float[Tensor, "rows C"]:
+    """A feature map's vectors, one a row."""
+    return features.permute(0, 2, 3, 1).flatten(0, 2)
+
+
+class StyleTargets:
+    """Style and content losses of an image against fixed targets (the two terms of Eq. 5).
+
+    Kept out of the model's modules: a stylised checkpoint holds neither the network nor the painting.
+
+    Args:
+        backbone: gives the features.
+        style_image: in [0, 1].
+        feature_side: longer side, in pixels, at which the network sees rendered and content pictures.
+        style_side: longer side at which it sees the style image; it sets how large strokes are.
+    """
+
+    def __init__(
+        self, backbone: VGGFeatures, style_image: Float[Tensor, "3 H W"], feature_side: int, style_side: int
+    ) -> None:
+        self.backbone = backbone
+        self.feature_side = feature_side
+        device = backbone.mean.device
+        with torch.no_grad():
+            self.style_rows = feature_rows(backbone(fit_side(style_image[None].to(device), style_side)))
+
+    def features(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 768 h w"]:
+        """The network's view of a picture."""
+        return self.backbone(fit_side(image.permute(2, 0, 1)[None], self.feature_side))
+
+    def losses(
+        self, image: Float[Tensor, "H W 3"], content: Float[Tensor, "1 768 h w"]
+    ) -> Tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+        """L_style and L_content of a rendered picture."""
+        features = self.features(image)
+        return nnfm_loss(feature_rows(features), self.style_rows), content_loss(features, content)

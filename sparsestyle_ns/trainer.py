@@ -1,0 +1,281 @@
+"""nerfstudio's trainer, made to keep what it has: whole checkpoints, also on Ctrl-C, and resuming where it stopped."""
+
+import copy
+import os
+import signal
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Dict, List, Literal, Tuple, Type
+
+import torch
+from nerfstudio.configs.base_config import MachineConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import writer
+from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from sparsestyle_ns.coarse_run import CoarseRun, check_scene, find_coarse_run, newest_checkpoint, read_coarse_run
+from sparsestyle_ns.errors import InputError, exit_on_input_error
+from sparsestyle_ns.scene_record import SceneRecord, record_scene
+
+
+def this_machine() -> MachineConfig:
+    """A GPU where there is one, else the CPU; nerfstudio's default is CUDA, which fails without."""
+    return MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu")
+
+
+@dataclass
+class FusedAdamConfig(AdamOptimizerConfig):
+    """Adam in one pass over memory."""
+
+    betas: Tuple[float, float] = (0.9, 0.999)
+    """Decay of the running means of the gradient and its square."""
+    fused: bool = True
+    """Whether to use the fused implementation; the values are the same up to rounding."""
+
+
+@dataclass
+class SparseStyleTrainerConfig(TrainerConfig):
+    """Settings of a run of either method."""
+
+    _target: Type = field(default_factory=lambda: SparseStyleTrainer)
+    machine: MachineConfig = field(default_factory=this_machine)
+    """Where to run; the GPU where there is one."""
+
+    @exit_on_input_error
+    def save_config(self) -> None:
+        """Writes config.yml into the run's folder."""
+        try:
+            super().save_config()
+        except OSError as error:
+            raise InputError(
+                f"The run can't be saved in {self.get_base_dir()} ({error.strerror}); name a folder that can be "
+                "written to with --output-dir."
+            ) from error
+
+
+class SparseStyleTrainer(Trainer):
+    """The trainer of both methods."""
+
+    config: SparseStyleTrainerConfig
+
+    @exit_on_input_error
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Sets up the run and records what it is trained on."""
+        super().setup(test_mode)
+        record_scene(self.pipeline.datamanager).save(self.base_dir)
+
+    def _load_checkpoint(self) -> None:
+        for source in (self.config.load_dir, self.config.load_checkpoint):
+            if source is not None and not source.exists():
+                raise InputError(
+                    f"There is nothing to resume at {source}; name a folder of checkpoints or a .ckpt file."
+                )
+        if self.config.load_dir is not None and newest_checkpoint(self.config.load_dir) is None:
+            raise InputError(
+                f"There is no checkpoint in {self.config.load_dir}; name a run's nerfstudio_models folder."
+            )
+        super()._load_checkpoint()
+
+    @exit_on_input_error
+    def train(self) -> None:
+        """Trains up to `max_num_iterations`, counted from the very first iteration, also when resuming.
+
+        Ctrl-C ends training after the iteration that is under way and saves a checkpoint; a second one stops at once.
+        """
+        total = self.config.max_num_iterations
+        if self._start_step >= total:
+            raise InputError(
+                f"The checkpoint is of iteration {self._start_step}, and --max-num-iterations is {total}; raise it to "
+                "train on."
+            )
+        self._interrupted = False
+        former = signal.signal(signal.SIGINT, self._on_interrupt) if self.local_rank == 0 else None
+        self.config.max_num_iterations = total - self._start_step
+        try:
+            super().train()
+        except TrainingInterruptedError:
+            self.save_checkpoint(self.step)
+            CONSOLE.print(f"Stopped after iteration {self.step + 1} of {total}; the checkpoint is saved.")
+        finally:
+            self.config.max_num_iterations = total
+            if former is not None:
+                signal.signal(signal.SIGINT, former)
+        self.report(interrupted=self._interrupted)
+
+    def _on_interrupt(self, number: int, frame: Any) -> None:
+        if self._interrupted or self.training_state != "training":
+            raise KeyboardInterrupt
+        self._interrupted = True
+        CONSOLE.print("Ctrl-C: finishing this iteration, then saving. Press it again to stop at once.")
+
+    def train_iteration(self, step: int) -> Any:
+        """One iteration; raises `TrainingInterruptedError` after it if Ctrl-C was pressed."""
+        result = super().train_iteration(step)
+        if self._interrupted:
+            raise TrainingInterruptedError
+        return result
+
+    def report(self, interrupted: bool) -> None:
+        """Prints what was made and what to type next."""
+        config = self.base_dir / "config.yml"
+        CONSOLE.print(f"\nSaved in {self.base_dir}", soft_wrap=True)
+        if interrupted:
+            CONSOLE.print(
+                f"Go on with: ns-train {self.config.method_name} --load-dir {self.checkpoint_dir} …", soft_wrap=True
+            )
+            return
+        for line in self.next_commands(config):
+            CONSOLE.print(f"Next: {line}", soft_wrap=True)
+
+    def next_commands(self, config: Path) -> List[str]:
+        """Commands that use the finished run."""
+        return [f"ns-viewer --load-config {config}"]
+
+    @check_main_thread
+    def save_checkpoint(self, step: int) -> None:
+        """Saves a checkpoint as nerfstudio does, but never a half-written one: it gets its name when it is whole."""
+        self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
+        target = self.checkpoint_dir / f"step-{step:09d}.ckpt"
+        unfinished = self.base_dir / "checkpoint.unfinished"  # nerfstudio takes every file beside `target` for one
+        torch.save(
+            {
+                "step": step,
+                "pipeline": getattr(self.pipeline, "module", self.pipeline).state_dict(),
+                "optimizers": {name: part.state_dict() for name, part in self.optimizers.optimizers.items()},
+                "schedulers": {name: part.state_dict() for name, part in self.optimizers.schedulers.items()},
+                "scalers": self.grad_scaler.state_dict(),
+            },
+            unfinished,
+        )
+        os.replace(unfinished, target)
+        if self.config.save_only_latest_checkpoint:
+            for path in self.checkpoint_dir.glob("*.ckpt"):
+                if path != target:
+                    path.unlink()
+
+
+class TrainingInterruptedError(Exception):
+    """Ctrl-C was pressed during the iteration that just ended."""
+
+
+class CoarseFewShotTrainer(SparseStyleTrainer):
+    """The trainer of stage 1."""
+
+    def next_commands(self, config: Path) -> List[str]:
+        """See `SparseStyleTrainer.next_commands`."""
+        style = self.config.method_name.replace("coarse-fewshot", "hier-style")
+        return [
+            f"ns-train {style} --style-image PAINTING.jpg --coarse-run {self.base_dir} --data {self.config.data} …",
+            *super().next_commands(config),
+        ]
+
+
+@dataclass
+class HierStyleTrainerConfig(SparseStyleTrainerConfig):
+    """Settings of a stylised run."""
+
+    _target: Type = field(default_factory=lambda: HierStyleTrainer)
+
+
+class HierStyleTrainer(SparseStyleTrainer):
+    """The trainer of stage 2: finds or trains the coarse run first."""
+
+    @exit_on_input_error
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Checks the style's files, makes sure of a coarse run, and sets up the stylised run."""
+        self.config.pipeline.check_style()
+        run = None
+        if self.config.load_dir is None and self.config.load_checkpoint is None:
+            run = self.coarse_run()
+            self.config.pipeline.coarse_run = run.folder.resolve()
+            self.config.pipeline.model.coarse_field = copy.deepcopy(run.config.pipeline.model.coarse_field)
+        else:
+            self._adopt_shape_of_checkpoint()
+        self._coarse_state = None if run is None else run.model_state()
+        self.config.save_config()
+        super().setup(test_mode)
+
+    def _load_checkpoint(self) -> None:
+        super()._load_checkpoint()
+        if self._coarse_state is not None:
+            self.pipeline.model.adopt_coarse(self._coarse_state)
+            self._coarse_state = None
+
+    def _adopt_shape_of_checkpoint(self) -> None:
+        """Takes the coarse field's settings from the run that is resumed; they came from its coarse run."""
+        import yaml
+
+        folder = self.config.load_dir or self.config.load_checkpoint.parent
+        path = folder.parent / "config.yml"
+        if path.is_file():
+            saved = yaml.load(path.read_text(), Loader=yaml.Loader)
+            self.config.pipeline.model.coarse_field = saved.pipeline.model.coarse_field
+            self.config.pipeline.coarse_run = saved.pipeline.coarse_run
+
+    def coarse_run(self) -> CoarseRun:
+        """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now.
+
+        Raises:
+            InputError: the run that was asked for doesn't exist or is of another scene.
+        """
+        scene = self._scene()
+        asked = self.config.pipeline.coarse_run
+        if asked is not None:
+            run = read_coarse_run(asked)
+            check_scene(run, scene)
+            CONSOLE.print(f"Stylising the coarse run {run.folder}.")
+            return run
+        draft = self.config.method_name.endswith("-draft")
+        methods = ("coarse-fewshot", "coarse-fewshot-draft") if draft else ("coarse-fewshot",)
+        found = find_coarse_run(self.config.output_dir, methods, scene)
+        if found is not None:
+            CONSOLE.print(f"Stylising the newest coarse run of this scene, {found.folder}.")
+            return found
+        CONSOLE.print("There is no finished coarse run of this scene and these views; training one first.")
+        return self._train_coarse(methods[-1])
+
+    def _scene(self) -> SceneRecord:
+        config = copy.deepcopy(self.config.pipeline.datamanager)
+        return record_scene(config.setup(device="cpu", test_mode="inference"))
+
+    def _train_coarse(self, method: str) -> CoarseRun:
+        from sparsestyle_ns.method_configs import method_config
+
+        config: TrainerConfig = copy.deepcopy(method_config(method))
+        ours: Dict[str, Any] = vars(self.config.pipeline.datamanager)
+        for name in (
+            "data",
+            "dataparser",
+            "num_views",
+            "view_ids",
+            "max_image_side",
+            "seed",
+            "camera_res_scale_factor",
+        ):
+            setattr(config.pipeline.datamanager, name, copy.deepcopy(ours[name]))
+        config.data, config.output_dir = self.config.data, self.config.output_dir
+        config.experiment_name, config.project_name = self.config.experiment_name, self.config.project_name
+        config.machine, config.logging = self.config.machine, self.config.logging
+        config.vis = "tensorboard"
+        config.viewer.quit_on_train_completion = True
+        config.set_timestamp()
+        config.save_config()
+        trainer = config.setup(local_rank=self.local_rank, world_size=self.world_size)
+        trainer.setup()
+        trainer.train()
+        if trainer._interrupted:
+            raise InputError(
+                "The coarse run was interrupted, so there is nothing to stylise yet; run the command again."
+            )
+        for state in (writer.EVENT_WRITERS, writer.EVENT_STORAGE, writer.GLOBAL_BUFFER):
+            state.clear()
+        return read_coarse_run(trainer.base_dir)
+
+    def next_commands(self, config: Path) -> List[str]:
+        """See `SparseStyleTrainer.next_commands`."""
+        return [
+            f"ns-render interpolate --load-config {config} --rendered-output-names rgb --output-path stylised.mp4",
+            *super().next_commands(config),
+        ]
