@@ -58,7 +58,7 @@ class SceneRecord:
             return f"it was trained on views {other.view_ids} ({', '.join(other.view_names)})"
         if self.space != other.space or self.background_color != other.background_color:
             return f"it lays the scene out as {other.space} with background {other.background_color}"
-        mine, theirs = self.cameras + [self.scene_box], other.cameras + [other.scene_box]
+        mine, theirs = [*self.cameras, self.scene_box], [*other.cameras, other.scene_box]
         if any(not np.allclose(first, second, atol=1e-4) for first, second in zip(mine, theirs, strict=True)):
             return "its cameras stand elsewhere: another scene, or other settings of the dataparser"
         return None

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Dict, List, Literal, Tuple, Type
 
+import numpy as np
 import torch
 from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
@@ -139,21 +140,33 @@ class SparseStyleTrainer(Trainer):
         self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
         target = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         unfinished = self.base_dir / "checkpoint.unfinished"  # nerfstudio takes every file beside `target` for one
-        torch.save(
-            {
-                "step": step,
-                "pipeline": getattr(self.pipeline, "module", self.pipeline).state_dict(),
-                "optimizers": {name: part.state_dict() for name, part in self.optimizers.optimizers.items()},
-                "schedulers": {name: part.state_dict() for name, part in self.optimizers.schedulers.items()},
-                "scalers": self.grad_scaler.state_dict(),
-            },
-            unfinished,
-        )
+        state = {
+            "step": step,
+            "pipeline": getattr(self.pipeline, "module", self.pipeline).state_dict(),
+            "optimizers": {name: part.state_dict() for name, part in self.optimizers.optimizers.items()},
+            "schedulers": {name: part.state_dict() for name, part in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+        }
+        torch.save(without_numpy_scalars(state), unfinished)
         os.replace(unfinished, target)
         if self.config.save_only_latest_checkpoint:
             for path in self.checkpoint_dir.glob("*.ckpt"):
                 if path != target:
                     path.unlink()
+
+
+def without_numpy_scalars(value: Any) -> Any:
+    """The same nested value with Python numbers for numpy's, which torch refuses to load (`weights_only`).
+
+    nerfstudio's exponential schedulers leave them in the state of scheduler and optimiser.
+    """
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, dict):
+        return type(value)((key, without_numpy_scalars(item)) for key, item in value.items())
+    if isinstance(value, (list, tuple)):
+        return type(value)(without_numpy_scalars(item) for item in value)
+    return value
 
 
 class TrainingInterruptedError(Exception):

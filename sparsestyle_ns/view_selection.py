@@ -12,7 +12,7 @@ DEFAULT_NUM_VIEWS = {"ndc": 3}
 
 
 def evenly_spaced(count: int, num_views: int) -> Tuple[int, ...]:
-    """`num_views` of 0 … count − 1, evenly spaced from the first to the last (RegNeRF's rule, with Python's rounding)."""
+    """`num_views` of 0 … count − 1, evenly spaced from first to last (RegNeRF's rule, with Python's rounding)."""
     if num_views >= count:
         return tuple(range(count))
     if num_views == 1:

@@ -1,10 +1,11 @@
-"""Multi-resolution hash grid ψ(x) (Sec. 3.1; instant-ngp, Sec. 3), split into what depends on positions and what learns.
+"""Multi-resolution hash grid ψ(x) (Sec. 3.1; instant-ngp, Sec. 3): what depends on positions, and what learns.
 
-`HashGrid.locate` gives the table rows and interpolation weights of points; `HashGrid.interpolate` gathers and sums them.
+`HashGrid.locate` gives the table rows and interpolation weights of points; `HashGrid.interpolate` gathers and sums.
 Points that stay the same from step to step are located once.
 """
 
-from typing import NamedTuple, Tuple
+import warnings
+from typing import NamedTuple, Optional, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -22,14 +23,20 @@ class GridLocation(NamedTuple):
     Attributes:
         indices: rows of the joined table, the eight corners of each point's cell on each level.
         weights: trilinear weights of those corners; they sum to 1 on each level.
+        scatter: `scatter_matrix` of these two, or None. With it the backward pass is fast on a CPU.
     """
 
     indices: Int[Tensor, "points levels 8"]
     weights: Float[Tensor, "points levels 8"]
+    scatter: Optional[Tensor] = None
 
-    def select(self, keep: Tensor) -> "GridLocation":
-        """The location of some of the points, by mask or indices."""
-        return GridLocation(self.indices[keep], self.weights[keep])
+    @property
+    def num_bytes(self) -> int:
+        """Memory that the location takes."""
+        dense = sum(part.numel() * part.element_size() for part in (self.indices, self.weights))
+        if self.scatter is None:
+            return dense
+        return dense + 4 * len(self.scatter) + 8 * self.weights.numel()
 
 
 def grid_resolutions(num_levels: int, min_resolution: int, max_resolution: int) -> Tuple[int, ...]:
@@ -62,19 +69,59 @@ def locate(positions: Float[Tensor, "points 3"], resolutions: Tuple[int, ...], t
     corners = lower.long()[:, :, None] + offsets
     near = torch.where(offsets.bool(), fraction[:, :, None], 1.0 - fraction[:, :, None])
     level_start = torch.arange(len(resolutions), device=positions.device)[:, None] * table_size
-    return GridLocation(hash_corners(corners, table_size) + level_start, near.prod(dim=-1))
+    return GridLocation((hash_corners(corners, table_size) + level_start).int(), near.prod(dim=-1))
+
+
+class _GatherSum(torch.autograd.Function):
+    """Weighted sums of table rows, whose backward pass is a product with a sparse matrix where one is at hand."""
+
+    @staticmethod
+    def forward(ctx, table: Tensor, location: GridLocation) -> Tensor:
+        ctx.location, ctx.rows = location, len(table)
+        points, levels, corners = location.indices.shape
+        bags = (points * levels, corners)
+        weights = location.weights.to(table.dtype).reshape(bags)
+        sums = F.embedding_bag(location.indices.reshape(bags), table, per_sample_weights=weights, mode="sum")
+        return sums.view(points, -1)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> Tuple[Tensor, None]:
+        indices, weights, scatter = ctx.location
+        features = grad.shape[-1] // indices.shape[1]
+        bags = grad.reshape(-1, features)
+        if scatter is not None:
+            return scatter @ bags, None
+        parts = weights.to(grad.dtype).reshape(-1, 8, 1) * bags[:, None]
+        table_grad = grad.new_zeros(ctx.rows, features).index_add_(0, indices.flatten().long(), parts.flatten(0, 1))
+        return table_grad, None
 
 
 def interpolate(table: Float[Tensor, "rows features"], location: GridLocation) -> Float[Tensor, "points encoded"]:
-    """Weighted sums of table rows: for each point and level, the eight corners' features; levels one after another."""
-    points, levels, corners = location.indices.shape
-    sums = F.embedding_bag(
-        location.indices.reshape(points * levels, corners),
-        table,
-        per_sample_weights=location.weights.reshape(points * levels, corners).to(table.dtype),
-        mode="sum",
-    )
-    return sums.view(points, -1)
+    """Weighted sums of table rows: for each point and level, the eight corners' features; levels one after another.
+
+    Differentiable in the table; locations are taken as given.
+    """
+    return _GatherSum.apply(table, location)
+
+
+def scatter_matrix(location: GridLocation, rows: int) -> Tensor:
+    """The matrix whose product with gradients of sums gives the gradient of the table: [rows, points · levels], CSR.
+
+    On a CPU it makes the backward pass several times as fast as adding gradients up one by one; building it takes
+    about as long as one backward pass without it, so it pays for locations that are used again and again.
+    """
+    indices = location.indices.flatten()
+    order = torch.argsort(indices, stable=True)
+    starts = F.pad(torch.cumsum(torch.bincount(indices, minlength=rows), dim=0), (1, 0))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        return torch.sparse_csr_tensor(
+            starts.int(),
+            (order // 8).int(),
+            location.weights.flatten()[order],
+            size=(rows, indices.numel() // 8),
+            check_invariants=False,
+        )
 
 
 class HashGrid(FieldComponent):
@@ -107,6 +154,12 @@ class HashGrid(FieldComponent):
     def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
         """`locate` on this grid's levels; positions in [0, 1]³."""
         return locate(positions, self.resolutions, self.table_size)
+
+    def for_reuse(self, location: GridLocation) -> GridLocation:
+        """The same location, prepared to be interpolated at many times."""
+        if location.indices.device.type != "cpu":
+            return location
+        return location._replace(scatter=scatter_matrix(location, len(self.table)))
 
     def interpolate(self, location: GridLocation) -> Float[Tensor, "points encoded"]:
         """`interpolate` in this grid's tables."""

@@ -57,7 +57,7 @@ class CoarseFewShotModelConfig(ModelConfig):
     coarse_field: CoarseFieldConfig = field(default_factory=CoarseFieldConfig)
     """The coarse field."""
     sampling: Literal["guided", "even"] = "guided"
-    """guided: samples go where a grid remembers density; even: evenly spaced over the ray, jittered (NeRF's first pass)."""
+    """guided: samples go where a grid remembers density; even: evenly over the ray, jittered, as NeRF's first pass."""
     num_samples: int = 24
     """Samples a ray in training."""
     num_eval_samples: int = 64

@@ -86,8 +86,19 @@ class HierStylePipelineConfig(VanillaPipelineConfig):
         Raises:
             InputError: they can't.
         """
-        load_style_image(required_style_image(self))
-        load_backbone(self.backbone, self.vgg_weights)
+        self.load_targets(torch.device("cpu"))
+
+    def load_targets(self, device: torch.device) -> StyleTargets:
+        """The painting as the feature network sees it.
+
+        Raises:
+            InputError: there is no style image or no weights, or they can't be read.
+        """
+        if self.style_image is None:
+            raise InputError("There is no style image: name a painting with --style-image FILE.")
+        image = load_style_image(self.style_image)
+        backbone = load_backbone(self.backbone, self.vgg_weights).to(device)
+        return StyleTargets(backbone, image.to(device), self.feature_side, self.style_side or self.feature_side)
 
 
 @dataclass
@@ -126,14 +137,9 @@ class HierStylePipeline(CheckedPipeline):
 
     def prepare_style(self) -> None:
         """Loads the painting and the feature network."""
-        config = self.config
-        image = load_style_image(required_style_image(config))
-        backbone = load_backbone(config.backbone, config.vgg_weights).to(self.device)
-        CONSOLE.print(f"Features: {backbone.description.name}, {backbone.description.source}")
-        self.style_image = image.to(self.device)
-        self.targets = StyleTargets(
-            backbone, self.style_image, config.feature_side, config.style_side or config.feature_side
-        )
+        self.targets = self.config.load_targets(self.device)
+        backbone = self.targets.backbone.description
+        CONSOLE.print(f"Features: {backbone.name}, {backbone.source}", soft_wrap=True)
 
     @torch.no_grad()
     def prepare_views(self) -> None:
@@ -218,7 +224,7 @@ class HierStylePipeline(CheckedPipeline):
         photos = len(self.datamanager.pixels.sizes)
         colors = torch.cat([picture.reshape(-1, 3) for picture in pictures[:photos]])
         weight = torch.cat([weight.reshape(-1) for weight in weights[:photos]])
-        style = color_moments(self.style_image.permute(1, 2, 0).reshape(-1, 3))
+        style = color_moments(self.targets.style_image.permute(1, 2, 0).reshape(-1, 3))
         matrix, offset = palette_transform(*color_moments(colors, weight), *style)
         transferred = [apply_palette(picture, matrix, offset, clamp=True) for picture in pictures]
         if self.model.background is None:
@@ -272,14 +278,3 @@ class HierStylePipeline(CheckedPipeline):
         style, content_loss = self.targets.losses(outputs["rgb"], content)
         self.train()
         return outputs, {"content_loss": content_loss, "style_loss": style}, {}
-
-
-def required_style_image(config: HierStylePipelineConfig) -> Path:
-    """The style image's path.
-
-    Raises:
-        InputError: none is set.
-    """
-    if config.style_image is None:
-        raise InputError("There is no style image: name a painting with --style-image FILE.")
-    return config.style_image

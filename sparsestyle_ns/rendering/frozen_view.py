@@ -32,16 +32,23 @@ class FrozenView:
     Args:
         runs: the rays of each chunk.
         freeze: gives the frozen samples of a run of rays.
+        prepare: makes frozen samples that are kept ready for being used many times.
         keep_bytes: memory that kept chunks may take; chunks past it are frozen again whenever they are rendered.
     """
 
-    def __init__(self, runs: List[slice], freeze: Callable[[slice], FrozenSamples], keep_bytes: float) -> None:
+    def __init__(
+        self,
+        runs: List[slice],
+        freeze: Callable[[slice], FrozenSamples],
+        prepare: Callable[[FrozenSamples], FrozenSamples],
+        keep_bytes: float,
+    ) -> None:
         self.runs = runs
         self.freeze = freeze
         self.kept: List[Optional[FrozenSamples]] = []
         self.kept_bytes = 0
         for run in runs:
-            frozen = freeze(run) if self.kept_bytes < keep_bytes else None
+            frozen = prepare(freeze(run)) if self.kept_bytes < keep_bytes else None
             if frozen is not None and self.kept_bytes + frozen.num_bytes <= keep_bytes:
                 self.kept_bytes += frozen.num_bytes
                 self.kept.append(frozen)

@@ -34,7 +34,7 @@ class StyleTargets:
 
     Args:
         backbone: gives the features.
-        style_image: in [0, 1].
+        style_image: in [0, 1], on the device of the network.
         feature_side: longer side, in pixels, at which the network sees rendered and content pictures.
         style_side: longer side at which it sees the style image; it sets how large strokes are.
     """
@@ -44,9 +44,9 @@ class StyleTargets:
     ) -> None:
         self.backbone = backbone
         self.feature_side = feature_side
-        device = backbone.mean.device
+        self.style_image = style_image
         with torch.no_grad():
-            self.style_rows = feature_rows(backbone(fit_side(style_image[None].to(device), style_side)))
+            self.style_rows = feature_rows(backbone(fit_side(style_image[None], style_side)))
 
     def features(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 768 h w"]:
         """The network's view of a picture."""
