@@ -163,7 +163,10 @@ def without_numpy_scalars(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, dict):
-        return type(value)((key, without_numpy_scalars(item)) for key, item in value.items())
+        plain = copy.copy(value)  # keeps the kind of dictionary: a MultiStepLR's milestones are a Counter
+        for key, item in value.items():
+            plain[key] = without_numpy_scalars(item)
+        return plain
     if isinstance(value, (list, tuple)):
         return type(value)(without_numpy_scalars(item) for item in value)
     return value

@@ -1,6 +1,83 @@
-"""Lets every test say `from reference import ...`, wherever in the tree it lies."""
+"""Lets every test say `from reference import ...`, and makes small scenes and runs that several tests look at."""
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import List
 
-sys.path.insert(0, str(Path(__file__).parent))
+import numpy as np
+import pytest
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "data_scripts")]
+
+TINY = [
+    *("--pipeline.datamanager.train-num-rays-per-batch", "128"),
+    *("--pipeline.model.coarse-field.layer-width", "32"),
+    *("--pipeline.model.coarse-field.feature-dim", "8"),
+]
+"""A coarse field that learns nothing good, in no time."""
+TINY_STYLE = [
+    *("--pipeline.model.log2-table-size", "12"),
+    *("--pipeline.model.num-steps", "16"),
+    *("--pipeline.model.occupancy-resolution", "16"),
+    *("--pipeline.feature-side", "48"),
+    *("--pipeline.warm-start-steps", "2"),
+    *("--pipeline.warm-start-rays", "64"),
+]
+
+
+def ns_train(method: str, data: Path, output_dir: Path, *flags: str, parser: str = "llff-data") -> None:
+    """Runs `ns-train` in this process, as its console script would."""
+    from nerfstudio.scripts import train
+
+    arguments = [method, "--data", str(data), "--output-dir", str(output_dir), "--vis", "tensorboard"]
+    run_entrypoint(train.entrypoint, [*arguments, "--viewer.quit-on-train-completion", "True", *flags, parser])
+
+
+def run_entrypoint(entrypoint, arguments: List[str]) -> None:
+    """Calls a console script's function with command line arguments."""
+    before = sys.argv
+    sys.argv = ["command", *map(str, arguments)]
+    try:
+        entrypoint()
+    finally:
+        sys.argv = before
+
+
+def only_run(output_dir: Path, method: str) -> Path:
+    """The folder of the one run of a method below an output folder."""
+    (config,) = output_dir.glob(f"*/{method}/*/config.yml")
+    return config.parent
+
+
+@pytest.fixture(scope="session")
+def llff_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A forward-facing scene of 12 photos, 32 × 24 pixels."""
+    import make_sample_scene
+
+    folder = tmp_path_factory.mktemp("scene")
+    make_sample_scene.main([str(folder), "--layout", "llff", "--width", "32", "--num-views", "12"])
+    return folder / "llff"
+
+
+@pytest.fixture(scope="session")
+def painting(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A style image of coloured noise."""
+    path = tmp_path_factory.mktemp("style") / "painting.png"
+    colors = np.random.default_rng(0).integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    Image.fromarray(colors).resize((64, 48), Image.Resampling.BICUBIC).save(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def runs(llff_scene: Path, painting: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """A coarse run of 3 iterations and a stylised run of 3 on it, both by ns-train: `.coarse`, `.style`, `.outputs`."""
+    outputs = tmp_path_factory.mktemp("outputs")
+    ns_train("coarse-fewshot", llff_scene, outputs, "--max-num-iterations", "3", *TINY)
+    style = ["--style-image", str(painting), "--max-num-iterations", "3", *TINY_STYLE]
+    ns_train("hier-style", llff_scene, outputs, *style)
+    return SimpleNamespace(
+        outputs=outputs, coarse=only_run(outputs, "coarse-fewshot"), style=only_run(outputs, "hier-style")
+    )

@@ -73,3 +73,94 @@ def content_weight(step, initial, decay, duration):
     for _ in range(min(step, duration)):
         weight *= decay ** (1 / duration)
     return weight
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# rendering
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def weights(depths):
+    """Weights of a ray's samples from their optical depths: what each takes of the light its predecessors left."""
+    light, taken = 1.0, []
+    for depth in depths:
+        taken.append(light * (1 - math.exp(-depth)))
+        light *= math.exp(-depth)
+    return taken
+
+
+def distortion(weights, edges):
+    """Σ_ij w_i w_j |m_i − m_j| + ⅓ Σ w_i² (s_{i+1} − s_i), all pairs one by one."""
+    middles = [(left + right) / 2 for left, right in zip(edges[:-1], edges[1:], strict=True)]
+    between = sum(
+        wi * wj * abs(mi - mj)
+        for wi, mi in zip(weights, middles, strict=True)
+        for wj, mj in zip(weights, middles, strict=True)
+    )
+    widths = [right - left for left, right in zip(edges[:-1], edges[1:], strict=True)]
+    return between + sum(w * w * width for w, width in zip(weights, widths, strict=True)) / 3
+
+
+def inverse_cdf(edges, weights, quantile):
+    """Where a histogram with these borders and masses has `quantile` of its mass to the left."""
+    wanted = quantile * sum(weights)
+    for left, right, weight in zip(edges[:-1], edges[1:], weights, strict=True):
+        if weight > 0 and wanted <= weight:
+            return left + wanted / weight * (right - left)
+        wanted -= weight
+    return edges[-1]
+
+
+def contract(point):
+    """x/2 where the largest coordinate |x| is below 1, else (1 − 1/(2|x|)) x/|x|: mip-NeRF 360's contraction, halved."""
+    norm = max(abs(coordinate) for coordinate in point)
+    factor = 0.5 if norm < 1 else (1 - 0.5 / norm) / norm
+    return [factor * coordinate for coordinate in point]
+
+
+def cell(position, resolution):
+    """Cell indices of a point in [−1, 1]³; a point outside belongs to the nearest cell."""
+    return tuple(min(max(math.floor((x + 1) / 2 * resolution), 0), resolution - 1) for x in position)
+
+
+def pixel(depths, colors, s, background=(0.0, 0.0, 0.0)):
+    """Colour over a background, Σw, and mean position Σws/Σw of one ray."""
+    ray = weights(depths)
+    opacity = sum(ray)
+    color = [
+        sum(w * c[channel] for w, c in zip(ray, colors, strict=True)) + (1 - opacity) * background[channel]
+        for channel in range(3)
+    ]
+    return color, opacity, sum(w * x for w, x in zip(ray, s, strict=True)) / opacity if opacity > 0 else 1.0
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# encodings
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def positional_encoding(x, num_levels):
+    """γ(x): x, then for each octave the sines of all coordinates and the cosines of all."""
+    encoded = list(x)
+    for octave in range(num_levels):
+        encoded += [math.sin(2**octave * coordinate) for coordinate in x]
+        encoded += [math.cos(2**octave * coordinate) for coordinate in x]
+    return encoded
+
+
+def hash_encoding(position, table, resolutions, table_size):
+    """ψ(x): on each level the eight corners' rows, each by the product of its nearness along the axes."""
+    encoded = []
+    for level, resolution in enumerate(resolutions):
+        features = [0.0] * len(table[0])
+        for corner in range(8):
+            weight, row = 1.0, 0
+            for axis, prime in enumerate((1, 2654435761, 805459861)):
+                scaled = position[axis] * resolution
+                step = corner >> axis & 1
+                weight *= scaled - math.floor(scaled) if step else 1 - (scaled - math.floor(scaled))
+                row ^= (math.floor(scaled) + step) * prime
+            stored = table[level * table_size + row % table_size]
+            features = [feature + weight * value for feature, value in zip(features, stored, strict=True)]
+        encoded += features
+    return encoded

@@ -1,13 +1,7 @@
-"""Regularisers of stage 1 that speak of geometry alone; the distortion loss is with the weights it is made of."""
+"""A regulariser of stage 1 that speaks of density alone; the distortion is with the weights it is made of."""
 
 from jaxtyping import Float
 from torch import Tensor
-
-
-def depth_roughness(depth: Float[Tensor, "patches side side"]) -> Float[Tensor, ""]:
-    """Mean squared difference of neighbouring depths on patches (RegNeRF, Eq. 3)."""
-    down, right = depth[:, 1:] - depth[:, :-1], depth[:, :, 1:] - depth[:, :, :-1]
-    return down.square().mean() + right.square().mean()
 
 
 def near_density(

@@ -13,12 +13,12 @@ from torch.nn import Parameter
 from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.field_components.positional_encoding import revealed_levels
 from sparsestyle_ns.fields.coarse import CoarseField, DensityActivation
-from sparsestyle_ns.losses.geometry import depth_roughness, near_density
+from sparsestyle_ns.losses.geometry import near_density
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.rendering.compositing import distortion, effective_samples
 from sparsestyle_ns.rendering.density_grid import DensityGrid
 from sparsestyle_ns.rendering.precision import Precision, autocast
-from sparsestyle_ns.rendering.sampling import even_edges
+from sparsestyle_ns.rendering.sampling import even_edges, jitter_directions
 from sparsestyle_ns.rendering.space import Segments, make_space
 from sparsestyle_ns.rendering.volume import DenseRender, render_coarse
 
@@ -68,14 +68,15 @@ class CoarseFewShotModelConfig(ModelConfig):
     """Share of guided samples, in (0, 1], that is spread evenly."""
     grid_resolution: int = 64
     """Cells along a side of the grid that remembers density."""
-    distortion_weight: float = 0.0
-    """Weight of the distortion loss, which gathers a ray's weight in one place; 0 is off."""
-    depth_smoothness_weight: float = 0.0
-    """Weight of the roughness of depth on patches seen from poses between the training views; 0 is off."""
-    depth_smoothness_every: int = 4
-    """Iterations from one use of the depth smoothness loss to the next."""
-    depth_smoothness_patches: int = 8
-    """Patches of 8 × 8 rays each time."""
+    distortion_weight: float = 0.02
+    """Weight of the distortion loss, which gathers a ray's weight in one place; 0 is off, as in the paper."""
+    distortion_start: float = 0.4
+    """Share of the iterations after which the distortion loss sets in."""
+    distortion_ramp: float = 0.3
+    """Share of the iterations, above 0, in which it then grows to its weight."""
+    direction_noise: float = 2.0
+    """Spread of the noise that is added to view directions in training, which are of length 1: few photos can't tell
+    what is shine and what is shape. 0 is off, as in the paper."""
     occlusion_weight: float = 0.0
     """Weight of density close to the camera (FreeNeRF's occlusion loss); 0 is off."""
     occlusion_range: float = 0.1
@@ -131,6 +132,11 @@ class CoarseFewShotModel(Model):
             revealed_levels(step / reveal, levels) if self.training and step < reveal else None
         )
 
+    def _distortion_share(self) -> float:
+        """How much of its weight the distortion loss has in this iteration, in [0, 1]."""
+        since = self.step / self.num_steps - self.config.distortion_start
+        return min(1.0, max(0.0, since / self.config.distortion_ramp))
+
     def _generator(self, stream: int) -> torch.Generator:
         seed = (self.config.seed * 1_000_003 + self.step) * 2 + stream
         return torch.Generator(device=self.device).manual_seed(seed)
@@ -149,10 +155,11 @@ class CoarseFewShotModel(Model):
         """Renders rays; also returns their segments and the samples' borders."""
         segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
         edges = self.place_samples(segments, num_samples, generator)
+        directions = ray_bundle.directions
+        if self.training and self.config.direction_noise > 0:
+            directions = jitter_directions(directions, self.config.direction_noise, self._generator(1))
         with autocast(self.device, self.config.precision):
-            render = render_coarse(
-                self.field, segments, ray_bundle.directions, edges, self.space.unbounded, self.background
-            )
+            render = render_coarse(self.field, segments, directions, edges, self.space.unbounded, self.background)
         return render, segments, edges
 
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
@@ -189,21 +196,13 @@ class CoarseFewShotModel(Model):
             return losses
         config = self.config
         if config.distortion_weight > 0:
-            losses["distortion_loss"] = (
-                config.distortion_weight * distortion(outputs["weights"], outputs["edges"]).mean()
-            )
+            weight = config.distortion_weight * self._distortion_share()
+            losses["distortion_loss"] = weight * distortion(outputs["weights"], outputs["edges"]).mean()
         if config.occlusion_weight > 0:
             losses["occlusion_loss"] = config.occlusion_weight * near_density(
                 outputs["density"], outputs["edges"], config.occlusion_range
             )
-        if "patches" in batch and config.depth_smoothness_weight > 0:
-            losses["depth_smoothness_loss"] = config.depth_smoothness_weight * self.patch_roughness(batch["patches"])
         return losses
-
-    def patch_roughness(self, patches: RayBundle) -> Tensor:
-        """Roughness of the expected depth, as s in [0, 1], on a bundle of [patches, side, side] rays."""
-        render, _, _ = self.render(patches.flatten(), self.config.num_samples // 2, self._generator(1))
-        return depth_roughness(render.s.view(patches.shape))
 
     def get_image_metrics_and_images(
         self, outputs: Dict[str, Tensor], batch: Dict[str, Tensor]

@@ -1,18 +1,25 @@
 """What the pipelines of both methods have in common."""
 
-from typing import Any, Dict
+from typing import Any, Dict, Literal
 
-from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
 from sparsestyle_ns.errors import InputError, exit_on_input_error
+from sparsestyle_ns.ffmpeg import put_ffmpeg_on_path
+
+TestMode = Literal["test", "val", "inference"]
 
 
 class CheckedPipeline(VanillaPipeline):
     """A pipeline that ends with a clear sentence on bad input, and never loads a checkpoint in part."""
 
     @exit_on_input_error
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    def __init__(
+        self, config: VanillaPipelineConfig, device: str, test_mode: TestMode = "val", *args: Any, **kwargs: Any
+    ) -> None:
+        super().__init__(config, device, test_mode, *args, **kwargs)
+        if test_mode != "val":
+            put_ffmpeg_on_path()
 
     @exit_on_input_error
     def load_pipeline(self, loaded_state: Dict[str, Any], step: int) -> None:

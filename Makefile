@@ -1,0 +1,54 @@
+# Everything here sets itself up: `make demo` on a fresh clone makes the environment first, and only once.
+#
+#   make demo PYTHON=python3.11          another Python for the environment
+#   make test VENV=/path/to/environment  an environment that exists already
+#   make demo DEMO="--scene blender"     options of data_scripts/demo.py
+
+PYTHON ?= python3
+VENV ?= .venv
+DEMO ?=
+
+BIN := $(abspath $(VENV))/bin
+READY := $(VENV)/.sparsestyle-installed
+# Workers share the cores; threads inside each would only get in each other's way.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint clean
+
+help:
+	@echo "make demo   sample photos and a painting -> stylised scene, video and page in demo/index.html"
+	@echo "make test   ruff, then the tests"
+	@echo "make lint   ruff alone; 'make lint FIX=1' repairs what it can"
+	@echo "make clean  removes the environment, caches and the demo"
+	@echo
+	@echo "The first of them makes an environment in $(VENV) (a few minutes, about 7 GB on a machine with CUDA wheels)."
+
+demo: $(READY)
+	$(BIN)/python data_scripts/demo.py $(DEMO)
+
+test: lint
+	$(PYTEST) --durations=5
+
+lint: $(READY)
+ifdef FIX
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+else
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+endif
+
+$(READY): pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install -c constraints.txt -e .[dev]
+	@touch $@
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))' || { \
+	    echo "Error: '$(PYTHON)' is missing or not Python 3.10, 3.11 or 3.12; name one: make $(MAKECMDGOALS) PYTHON=python3.11" >&2; \
+	    exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+clean:
+	rm -rf .venv demo build dist *.egg-info .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

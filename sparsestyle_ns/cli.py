@@ -1,0 +1,59 @@
+"""`sparsestyle ...`: what has no ns-* command of its own.
+
+A subcommand is a function here: its arguments and docstring are the command line and its help. It imports what it needs
+when it runs, so that help is there at once.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Callable, Dict, Optional, Sequence, Tuple
+
+import tyro
+
+from sparsestyle_ns.errors import InputError, exit_on_input_error
+
+
+@exit_on_input_error
+def gallery(
+    runs: Annotated[Tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")],
+    output_path: Path,
+    video: Tuple[Path, ...] = (),
+    title: str = "Stylised scenes",
+    num_views: int = 3,
+) -> None:
+    """Makes one HTML page of stylised runs that opens without a network.
+
+    Args:
+        runs: Stylised runs to show, each by its folder or its config.yml.
+        output_path: The page to write.
+        video: MP4 files, as ns-render writes them, for the runs in the same order.
+        title: Heading of the page.
+        num_views: Held-out views to render of each run.
+    """
+    from sparsestyle_ns.gallery import collect_run, find_config, prepare_folder, read_video, write_page
+
+    if not runs:
+        raise InputError("There is no run to show; name at least one run's folder.")
+    if len(video) > len(runs):
+        raise InputError(f"There are {len(video)} videos for {len(runs)} runs; give at most one for each run.")
+    configs = [find_config(run) for run in runs]
+    for path in video:
+        read_video(path)
+    prepare_folder(output_path)  # rendering takes minutes, so what can fail without it fails before
+    videos = [*video, *[None] * (len(runs) - len(video))]
+    pictures = [collect_run(config, path, num_views) for config, path in zip(configs, videos, strict=True)]
+    print(f"The page is {write_page(pictures, output_path, title)}")
+
+
+SUBCOMMANDS: Dict[str, Callable[..., Any]] = {
+    "gallery": gallery,
+}
+
+
+def main(arguments: Optional[Sequence[str]] = None) -> None:
+    """The command line; `arguments` default to the process's own."""
+    tyro.extras.subcommand_cli_from_dict(
+        SUBCOMMANDS,
+        prog="sparsestyle",
+        description="Tools around stylised scenes. Training, rendering and viewing are nerfstudio's ns-* commands.",
+        args=arguments,
+    )

@@ -1,0 +1,146 @@
+"""What the commands say when they can't go on: one sentence, exit status not 0, and nothing is lost."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import List
+
+import numpy as np
+import pytest
+from conftest import TINY, TINY_STYLE, ns_train
+from PIL import Image
+
+
+def refusal(method: str, scene: Path, outputs: Path, *flags: str) -> str:
+    """The sentence with which a command ends."""
+    with pytest.raises(SystemExit) as ended:
+        ns_train(method, scene, outputs, "--max-num-iterations", "2", *flags)
+    message = str(ended.value.code)
+    assert message.startswith("Error: ")
+    assert message.count("\n") == 0
+    return message
+
+
+def style_flags(runs: SimpleNamespace, painting: Path) -> List[str]:
+    return ["--style-image", str(painting), "--coarse-run", str(runs.coarse), *TINY_STYLE]
+
+
+def test_a_refusal_goes_to_stderr_without_a_traceback_and_exits_with_1(llff_scene: Path, tmp_path: Path) -> None:
+    script = "from nerfstudio.scripts.train import entrypoint; entrypoint()"
+    command = [sys.executable, "-c", script, "hier-style", "--data", str(llff_scene), "--output-dir", str(tmp_path)]
+    result = subprocess.run([*command, "llff-data"], capture_output=True, text=True, timeout=300)
+    assert result.returncode == 1
+    assert "Traceback" not in result.stderr
+    assert result.stderr.strip().splitlines()[-1].startswith("Error: There is no style image: name a painting with")
+
+
+def test_a_missing_style_image_is_named_before_anything_is_trained(llff_scene: Path, tmp_path: Path) -> None:
+    message = refusal("hier-style", llff_scene, tmp_path, "--style-image", "nowhere.png")
+    assert "nowhere.png" in message
+    assert not list(tmp_path.rglob("coarse-fewshot"))
+
+
+def test_a_broken_style_image_is_named(llff_scene: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"\x89PNG not really")
+    assert "broken.png" in refusal("hier-style", llff_scene, tmp_path / "outputs", "--style-image", str(broken))
+
+
+def test_a_folder_without_poses_says_what_is_missing(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    message = refusal("coarse-fewshot", tmp_path / "photos", tmp_path / "outputs")
+    assert "poses_bounds.npy" in message
+
+
+def test_photos_that_dont_match_the_poses_in_number_are_counted(llff_scene: Path, tmp_path: Path) -> None:
+    scene = shutil.copytree(llff_scene, tmp_path / "scene")
+    (scene / "images" / "image003.png").unlink()
+    message = refusal("coarse-fewshot", scene, tmp_path / "outputs")
+    assert "11" in message
+    assert "12" in message
+
+
+def test_a_photo_of_another_size_is_named(llff_scene: Path, tmp_path: Path) -> None:
+    scene = shutil.copytree(llff_scene, tmp_path / "scene")
+    Image.fromarray(np.zeros((24, 24, 3), np.uint8)).save(scene / "images" / "image005.png")
+    assert "image005.png" in refusal("coarse-fewshot", scene, tmp_path / "outputs")
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--view-ids", "1", "99"], "99"),
+        (["--view-ids", "0", "1"], "can be trained on are 1, 2"),
+        (["--view-ids", "1", "1"], "only once"),
+        (["--num-views", "0"], "at least one"),
+        (["--num-views", "11"], "only 10 views"),
+    ],
+)
+def test_views_that_dont_exist_are_named(llff_scene: Path, tmp_path: Path, flags: List[str], words: str) -> None:
+    assert words in refusal("coarse-fewshot", llff_scene, tmp_path, *flags)
+
+
+def test_a_coarse_run_of_another_scene_is_refused(
+    runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path
+) -> None:
+    other = shutil.copytree(llff_scene, tmp_path / "other")
+    poses = np.load(other / "poses_bounds.npy")
+    poses[5, 3] += 0.5
+    np.save(other / "poses_bounds.npy", poses)
+    message = refusal("hier-style", other, tmp_path / "outputs", *style_flags(runs, painting))
+    assert "doesn't fit" in message
+
+
+def test_a_coarse_run_of_other_views_is_refused(
+    runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path
+) -> None:
+    flags = [*style_flags(runs, painting), "--num-views", "2"]
+    assert "trained on views [1, 5, 11]" in refusal("hier-style", llff_scene, tmp_path, *flags)
+
+
+def test_a_coarse_run_that_is_none_is_refused(
+    runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path
+) -> None:
+    for path, words in ((tmp_path / "nowhere", "no config.yml"), (runs.style, "a coarse-fewshot run is needed")):
+        flags = ["--style-image", str(painting), "--coarse-run", str(path), *TINY_STYLE]
+        assert words in refusal("hier-style", llff_scene, tmp_path / "outputs", *flags)
+
+
+def test_missing_weights_name_all_three_ways_out(
+    runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import urllib.error
+
+    import torch
+
+    def no_network(*args: object, **kwargs: object) -> None:
+        raise urllib.error.URLError("no network")
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "empty"))
+    monkeypatch.setattr(torch.hub, "download_url_to_file", no_network)
+    message = refusal("hier-style", llff_scene, tmp_path, *style_flags(runs, painting), "--backbone", "vgg16")
+    for way in ("--vgg-weights", "vgg16-397923af.pth", "vgg16-shift-tolerant"):
+        assert way in message
+
+
+def test_an_output_folder_that_cant_be_written_to_is_named(llff_scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    message = refusal("coarse-fewshot", llff_scene, tmp_path / "file", *TINY)
+    assert "--output-dir" in message
+
+
+def test_nothing_to_resume_is_said(llff_scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    for folder, words in ((tmp_path / "nowhere", "nothing to resume"), (tmp_path / "empty", "no checkpoint")):
+        flags = ["--load-dir", str(folder), *TINY]
+        assert words in refusal("coarse-fewshot", llff_scene, tmp_path / "outputs", *flags)
+
+
+def test_a_refused_command_leaves_former_runs_alone(runs: SimpleNamespace, llff_scene: Path, painting: Path) -> None:
+    before = {path: os.stat(path).st_mtime_ns for path in runs.outputs.rglob("*") if path.is_file()}
+    refusal("hier-style", llff_scene, runs.outputs, "--style-image", "nowhere.png")
+    after = {path: os.stat(path).st_mtime_ns for path in before}
+    assert before == after

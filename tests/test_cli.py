@@ -1,0 +1,90 @@
+"""`sparsestyle`: help is there at once, and what can't be used is said in one sentence."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from sparsestyle_ns import gallery as gallery_module
+from sparsestyle_ns.cli import SUBCOMMANDS, main
+
+
+def run_main(arguments, capsys):
+    """(exit status or message, what was printed)."""
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    return ended.value.code, capsys.readouterr().out
+
+
+def test_help_lists_every_subcommand(capsys):
+    status, printed = run_main(["--help"], capsys)
+    assert status == 0
+    assert all(name in printed for name in SUBCOMMANDS)
+    assert "gallery" in SUBCOMMANDS
+
+
+def test_help_loads_neither_torch_nor_nerfstudio():
+    code = (
+        "import sys, sparsestyle_ns.cli as cli\n"
+        "try:\n    cli.main(['--help'])\n"
+        "except SystemExit:\n    print([name for name in ('torch', 'nerfstudio', 'cv2') if name in sys.modules])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["{tmp}/gone"], "Error: There is no run at {tmp}/gone;"),
+        (["{tmp}/coarse"], "Error: {tmp}/coarse is a run of coarse-fewshot, which stylises nothing;"),
+        ([], "Error: There is no run to show;"),
+        (["{tmp}/run", "--video", "{tmp}/1.mp4", "{tmp}/2.mp4"], "Error: There are 2 videos for 1 runs;"),
+        (["{tmp}/run", "--video", "{tmp}/gone.mp4"], "Error: The video {tmp}/gone.mp4 can't be read"),
+        (["{tmp}/run", "--output-path", "{tmp}"], "Error: --output-path {tmp} is a folder;"),
+        (["{tmp}/run", "--output-path", "{tmp}/run/config.yml/page.html"], "Error: The page can't be written to"),
+    ],
+)
+def test_what_can_not_be_used_is_said_in_one_sentence(tmp_path, capsys, arguments, sentence):
+    for name, method in (("run", "hier-style"), ("coarse", "coarse-fewshot")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.yml").write_text(f"method_name: {method}\n")
+    given = [argument.format(tmp=tmp_path) for argument in arguments]
+    if "--output-path" not in given:
+        given += ["--output-path", str(tmp_path / "page.html")]
+    message, _ = run_main(["gallery", *given], capsys)
+    assert message.startswith(sentence.format(tmp=tmp_path))
+    assert "\n" not in message
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_an_error_goes_to_stderr_with_exit_status_1(tmp_path):
+    arguments = ["gallery", str(tmp_path / "gone"), "--output-path", str(tmp_path / "page.html")]
+    done = subprocess.run(
+        [sys.executable, "-c", "from sparsestyle_ns.cli import main; main()", *arguments],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "COLUMNS": "200"},
+    )
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert done.stderr.startswith("Error: There is no run at")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_gallery_gives_each_run_its_video_and_says_last_where_the_page_is(tmp_path, capsys, monkeypatch):
+    film = tmp_path / "film.mp4"
+    film.write_bytes(b"\0\0\0\x18ftyp")
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.yml").write_text("method_name: hier-style\n")
+    pages = []
+    monkeypatch.setattr(gallery_module, "collect_run", lambda *given: given)
+    monkeypatch.setattr(gallery_module, "write_page", lambda *given: pages.append(given) or given[1])
+    target = tmp_path / "page.html"
+    given = [str(tmp_path / "first"), str(tmp_path / "second" / "config.yml"), "--output-path", str(target)]
+    main(["gallery", *given, "--video", str(film), "--title", "Two scenes", "--num-views", "2"])
+    runs = [(tmp_path / "first" / "config.yml", film, 2), (tmp_path / "second" / "config.yml", None, 2)]
+    assert pages == [(runs, target, "Two scenes")]
+    assert capsys.readouterr().out.splitlines()[-1] == f"The page is {target}"

@@ -1,0 +1,252 @@
+"""The commands that a user types, run as nerfstudio runs them on a tiny scene."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+import yaml
+from conftest import TINY, TINY_STYLE, ns_train, only_run, run_entrypoint
+
+from sparsestyle_ns.coarse_run import newest_checkpoint
+from sparsestyle_ns.method_configs import method_config
+
+METHODS = ("coarse-fewshot", "coarse-fewshot-draft", "hier-style", "hier-style-draft")
+HASH_TABLE = "_model.residual.grid.table"
+
+
+def load(run: Path) -> dict:
+    return torch.load(newest_checkpoint(run / "nerfstudio_models"), weights_only=True)
+
+
+def render(subcommand: str, run: Path, output: Path, *flags: str) -> None:
+    from nerfstudio.scripts import render
+
+    run_entrypoint(
+        render.entrypoint, [subcommand, "--load-config", str(run / "config.yml"), "--output-path", str(output), *flags]
+    )
+
+
+def assert_same_state(first: dict, second: dict) -> None:
+    assert first.keys() == second.keys()
+    for key, value in first.items():
+        assert torch.equal(value, second[key]), key
+
+
+def test_a_fresh_process_lists_the_methods_and_the_llff_dataparser() -> None:
+    script = (
+        "from nerfstudio.configs.method_configs import all_methods; print(*all_methods); "
+        "from nerfstudio.data.datamanagers.base_datamanager import AnnotatedDataParserUnion; "
+        "from nerfstudio.configs.dataparser_configs import all_dataparsers; print(*all_dataparsers)"
+    )
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr
+    words = result.stdout.split()
+    assert set(METHODS) <= set(words)
+    assert "llff-data" in words
+
+
+def test_drafts_are_the_same_methods_with_other_numbers() -> None:
+    for method in ("coarse-fewshot", "hier-style"):
+        full, draft = method_config(method), method_config(f"{method}-draft")
+        assert type(full) is type(draft)
+        assert type(full.pipeline.model) is type(draft.pipeline.model)
+        assert draft.max_num_iterations < full.max_num_iterations
+        assert draft.pipeline.datamanager.max_image_side < full.pipeline.datamanager.max_image_side
+
+
+def test_the_defaults_are_the_papers() -> None:
+    coarse, style = method_config("coarse-fewshot"), method_config("hier-style")
+    assert coarse.max_num_iterations == 50_000
+    assert coarse.optimizers["fields"]["optimizer"].lr == 5e-4
+    assert coarse.optimizers["fields"]["scheduler"] is None
+    field = coarse.pipeline.model.coarse_field
+    assert (field.num_levels, field.num_layers) == (7, 6)
+    optimizer, scheduler = (style.optimizers["fields"][part] for part in ("optimizer", "scheduler"))
+    assert (optimizer.lr, optimizer.betas) == (5e-3, (0.9, 0.999))
+    assert (scheduler.gamma, scheduler.milestones) == (0.33, (50, 100))
+    settings, model = style.pipeline, style.pipeline.model
+    assert (settings.content_weight, settings.content_decay, settings.content_steps) == (10.0, 0.01, 100)
+    assert (model.hash_levels, model.min_resolution, model.max_resolution) == (8, 128, 512)
+    assert (model.features_per_level, model.log2_table_size) == (4, 19)
+    assert (model.hidden_layers, model.layer_width, model.residual_density) == (2, 256, True)
+
+
+def test_the_views_in_use_are_saved_with_the_run(runs: SimpleNamespace) -> None:
+    for run in (runs.coarse, runs.style):
+        scene = json.loads((run / "scene.json").read_text())
+        assert scene["view_ids"] == [1, 5, 11]  # of 12 photos, 0 and 8 are held out; evenly spaced in the other ten
+        assert scene["view_names"] == ["image001.png", "image005.png", "image011.png"]
+        assert scene["space"] == "ndc"
+
+
+def test_a_stylised_checkpoint_holds_the_whole_scene_and_nothing_else(runs: SimpleNamespace) -> None:
+    coarse, style = load(runs.coarse)["pipeline"], load(runs.style)["pipeline"]
+    fields = {key for key in coarse if key.startswith(("_model.field.", "_model.space."))}
+    assert set(coarse) == fields | {"_model.device_indicator_param", "_model.grid.density"}
+    assert set(style) == fields | {
+        "_model.device_indicator_param",
+        "_model.occupancy.occupied",
+        HASH_TABLE,
+        *(f"_model.residual.mlp.layers.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")),
+        *(f"_model.residual.{head}_head.{part}" for head in ("color", "density") for part in ("weight", "bias")),
+    }
+    assert_same_state({key: coarse[key] for key in fields}, {key: style[key] for key in fields})
+
+
+def test_a_stylised_run_renders_without_painting_weights_and_coarse_run(
+    runs: SimpleNamespace, llff_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sparsestyle_ns.pipelines.hier_style as pipeline
+
+    def refuse(*args: object) -> None:
+        raise AssertionError("rendering asked for the painting or the feature network")
+
+    monkeypatch.setattr(pipeline, "load_style_image", refuse)
+    monkeypatch.setattr(pipeline, "load_backbone", refuse)
+    monkeypatch.setattr(pipeline.HierStylePipelineConfig, "load_targets", refuse)
+    hidden = runs.coarse.rename(runs.coarse.parent / "hidden")
+    try:
+        names = ["rgb", "rgb_coarse", "depth", "accumulation"]
+        render("dataset", runs.style, tmp_path, "--split", "test", "--rendered-output-names", *names)
+    finally:
+        hidden.rename(runs.coarse)
+    for name in names:
+        pictures = sorted((tmp_path / "test" / name).glob("*.jpg"))
+        assert [path.stem for path in pictures] == ["image000", "image008"]
+        assert iio.imread(pictures[0]).shape[:2] == (24, 32)
+
+
+@pytest.mark.parametrize("kind", ["coarse", "style"])
+def test_interpolated_spiral_and_camera_paths_render(runs: SimpleNamespace, tmp_path: Path, kind: str) -> None:
+    run, images = getattr(runs, kind), ["--output-format", "images"]
+    render("interpolate", run, tmp_path / "between", *images, "--interpolation-steps", "2", "--pose-source", "train")
+    render("spiral", run, tmp_path / "spiral", *images, "--seconds", "0.1", "--frame-rate", "20")
+    pose = np.eye(4)
+    camera = {"camera_to_world": pose.flatten().tolist(), "fov": 50, "aspect": 1}
+    path = tmp_path / "path.json"
+    path.write_text(
+        json.dumps(
+            {
+                "camera_type": "perspective",
+                "render_height": 16,
+                "render_width": 20,
+                "fps": 2,
+                "seconds": 1,
+                "camera_path": [camera, camera],
+            }
+        )
+    )
+    render("camera-path", run, tmp_path / "path", *images, "--camera-path-filename", str(path))
+    assert len(list((tmp_path / "between").glob("*.jpg"))) >= 3
+    assert len(list((tmp_path / "spiral").glob("*.jpg"))) == 2
+    frames = sorted((tmp_path / "path").glob("*.jpg"))
+    assert [iio.imread(frame).shape for frame in frames] == [(16, 20, 3)] * 2
+
+
+def test_ns_eval_writes_the_coarse_fields_quality_for_both_methods(runs: SimpleNamespace, tmp_path: Path) -> None:
+    from nerfstudio.scripts import eval as ns_eval
+
+    values = {}
+    for kind, prefix in (("coarse", ""), ("style", "coarse_")):
+        output = tmp_path / f"{kind}.json"
+        arguments = ["--load-config", str(getattr(runs, kind) / "config.yml"), "--output-path", str(output)]
+        run_entrypoint(ns_eval.entrypoint, arguments)
+        results = json.loads(output.read_text())["results"]
+        values[kind] = results[f"{prefix}psnr"]
+        assert 0 < values[kind] < 50
+        assert -1 <= results[f"{prefix}ssim"] <= 1
+    assert values["style"] == pytest.approx(values["coarse"], abs=1.0)  # the same field, sampled in two ways
+
+
+@pytest.mark.parametrize("method", ["coarse-fewshot", "hier-style"])
+def test_a_resumed_run_ends_as_one_that_was_never_stopped(
+    runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path, method: str
+) -> None:
+    flags = TINY
+    if method == "hier-style":
+        flags = ["--style-image", str(painting), "--coarse-run", str(runs.coarse), *TINY_STYLE]
+    ns_train(method, llff_scene, tmp_path / "whole", "--max-num-iterations", "6", *flags)
+    ns_train(method, llff_scene, tmp_path / "first", "--max-num-iterations", "3", *flags)
+    first = only_run(tmp_path / "first", method)
+    resume = ["--load-dir", str(first / "nerfstudio_models"), "--max-num-iterations", "6"]
+    ns_train(method, llff_scene, tmp_path / "second", *resume, *flags)
+    whole, second = load(only_run(tmp_path / "whole", method)), load(only_run(tmp_path / "second", method))
+    assert whole["step"] == second["step"] == 5
+    assert_same_state(whole["pipeline"], second["pipeline"])
+    assert whole["schedulers"] == second["schedulers"]
+    groups = (state["optimizers"]["fields"]["param_groups"][0]["lr"] for state in (whole, second))
+    assert len(set(groups)) == 1
+
+
+def test_hier_style_trains_the_coarse_run_itself_where_there_is_none(
+    llff_scene: Path, painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    coarse = method_config("coarse-fewshot")
+    monkeypatch.setattr(coarse, "max_num_iterations", 2)
+    monkeypatch.setattr(coarse.pipeline.model.coarse_field, "layer_width", 32)
+    style = ["--style-image", str(painting), "--num-views", "2", "--max-num-iterations", "2", *TINY_STYLE]
+    ns_train("hier-style", llff_scene, tmp_path, *style)
+    trained, stylised = only_run(tmp_path, "coarse-fewshot"), only_run(tmp_path, "hier-style")
+    config = yaml.load((stylised / "config.yml").read_text(), Loader=yaml.Loader)
+    assert config.pipeline.coarse_run == trained.resolve()
+    assert json.loads((trained / "scene.json").read_text())["view_ids"] == [1, 11]
+    assert load(trained)["step"] == load(stylised)["step"] == 1
+
+
+def test_ctrl_c_leaves_a_checkpoint_that_renders(
+    llff_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
+
+    get_loss_dict = CoarseFewShotModel.get_loss_dict
+
+    def press_ctrl_c(self, *args, **kwargs):
+        if self.step == 2:
+            signal.raise_signal(signal.SIGINT)
+        return get_loss_dict(self, *args, **kwargs)
+
+    monkeypatch.setattr(CoarseFewShotModel, "get_loss_dict", press_ctrl_c)
+    ns_train("coarse-fewshot", llff_scene, tmp_path / "outputs", "--max-num-iterations", "50", *TINY)
+    run = only_run(tmp_path / "outputs", "coarse-fewshot")
+    assert load(run)["step"] == 2
+    assert "Stopped after iteration 3 of 50" in capsys.readouterr().out
+    render("dataset", run, tmp_path / "pictures", "--split", "test", "--rendered-output-names", "rgb")
+    assert len(list((tmp_path / "pictures").rglob("*.jpg"))) == 2
+
+
+def test_resuming_a_finished_run_says_so_and_keeps_it(runs: SimpleNamespace, llff_scene: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(runs.coarse / "nerfstudio_models", tmp_path / "models")
+    flags = ["--load-dir", str(folder), "--max-num-iterations", "3", *TINY]
+    with pytest.raises(SystemExit, match="raise it to train on"):
+        ns_train("coarse-fewshot", llff_scene, tmp_path / "outputs", *flags)
+    assert newest_checkpoint(folder) is not None
+
+
+def test_a_checkpoint_of_another_shape_is_refused_instead_of_loaded_in_part(
+    runs: SimpleNamespace, llff_scene: Path, tmp_path: Path
+) -> None:
+    flags = ["--load-dir", str(runs.coarse / "nerfstudio_models"), "--max-num-iterations", "6"]
+    with pytest.raises(SystemExit, match="doesn't fit this configuration"):
+        ns_train("coarse-fewshot", llff_scene, tmp_path, *flags, "--pipeline.model.coarse-field.layer-width", "16")
+
+
+def test_blender_scenes_train_too(tmp_path: Path, painting: Path) -> None:
+    import make_sample_scene
+
+    sizes = ["--num-train", "9", "--num-val", "1", "--num-test", "1", "--width", "16"]
+    make_sample_scene.main([str(tmp_path), "--layout", "blender", *sizes])
+    scene, outputs = tmp_path / "blender", tmp_path / "outputs"
+    ns_train("coarse-fewshot", scene, outputs, "--max-num-iterations", "2", *TINY, parser="blender-data")
+    style = ["--style-image", str(painting), "--max-num-iterations", "2", *TINY_STYLE]
+    ns_train("hier-style", scene, outputs, *style, parser="blender-data")
+    saved = json.loads((only_run(outputs, "hier-style") / "scene.json").read_text())
+    assert (saved["space"], saved["background_color"]) == ("box", [1.0, 1.0, 1.0])
+    assert saved["view_ids"] == [0, 1, 2, 3, 5, 6, 7, 8]  # eight evenly spaced of nine: too few for the standard eight

@@ -1,0 +1,207 @@
+"""The demo's flight looks where it should, and what is finished isn't done again."""
+
+import importlib.util
+import json
+import os
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.camera_paths import get_path_from_json
+
+SCRIPT = Path(__file__).parents[1] / "data_scripts" / "demo.py"
+
+
+def load_script():
+    spec = importlib.util.spec_from_file_location("demo", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["demo"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+demo = load_script()
+
+
+def forward_facing_poses():
+    """Five cameras around the origin that look along -z, in a cross of 0.4 by 0.2."""
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, 3] = [(0, 0, 0), (0.2, 0, 0), (-0.2, 0, 0), (0, 0.1, 0), (0, -0.1, 0)]
+    return poses
+
+
+def read_path(poses, size=(252, 189), focal_over_height=1.0):
+    """What ns-render makes of a camera path that went through a file."""
+    return get_path_from_json(json.loads(json.dumps(demo.camera_path(poses, size, focal_over_height))))
+
+
+def seen_at(cameras, point):
+    """(N, 2) pixel positions, x first, at which cameras see a point."""
+    poses = cameras.camera_to_worlds
+    local = torch.einsum("nij,ni->nj", poses[..., :3], torch.tensor(point) - poses[..., 3])
+    focal = torch.stack([cameras.fx[:, 0], -cameras.fy[:, 0]], dim=-1).float()
+    assert torch.all(local[:, 2] < 0)
+    return focal * local[:, :2] / -local[:, 2:] + torch.stack([cameras.cx[:, 0], cameras.cy[:, 0]], dim=-1)
+
+
+def test_ellipse_keeps_the_focus_in_the_middle_of_every_frame():
+    cameras = read_path(demo.ellipse_path(forward_facing_poses(), focus_distance=3.0, frames=12))
+    assert cameras.size == 12
+    middle = torch.tensor([126.0, 94.0]).expand(12, 2)
+    torch.testing.assert_close(seen_at(cameras, (0.0, 0.0, -3.0)), middle, atol=1e-3, rtol=0)
+
+
+def test_ellipse_is_as_wide_and_high_as_the_photos_spread():
+    poses = forward_facing_poses()
+    positions = demo.ellipse_path(poses, focus_distance=1.0, frames=4)[:, :3, 3]
+    spread = np.sqrt((poses[:, :3, 3] ** 2).mean(0))
+    expected = [(spread[0], 0, 0), (0, spread[1], 0), (-spread[0], 0, 0), (0, -spread[1], 0)]
+    np.testing.assert_allclose(positions, expected, atol=1e-12)
+
+
+def test_ellipse_moves_even_where_all_photos_were_taken_from_one_spot():
+    positions = demo.ellipse_path(np.tile(np.eye(4), (3, 1, 1)), focus_distance=2.0, frames=8)[:, :3, 3]
+    np.testing.assert_allclose(np.linalg.norm(positions, axis=-1), 0.06)
+
+
+def test_ellipse_follows_the_cameras_into_any_direction():
+    turn = np.array([[0.0, 0, 1, 4], [1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 0, 1]])
+    straight = demo.ellipse_path(forward_facing_poses(), 3.0, 6)
+    np.testing.assert_allclose(demo.ellipse_path(turn @ forward_facing_poses(), 3.0, 6), turn @ straight, atol=1e-12)
+
+
+def test_orbit_goes_all_around_at_the_photos_height_and_looks_at_the_origin():
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :3, 3] = [(3, 0, 2), (0, 3, 2), (-3, 0, 2), (0, -3, 2)]
+    path = demo.orbit_path(poses, 8)
+    np.testing.assert_allclose(path[:, 2, 3], 2.0)
+    np.testing.assert_allclose(np.linalg.norm(path[:, :3, 3], axis=-1), np.sqrt(13))
+    assert np.allclose(path[:, :3, 3].mean(0), (0, 0, 2))
+    cameras = read_path(path, size=(100, 100))
+    torch.testing.assert_close(seen_at(cameras, (0.0, 0.0, 0.0)), torch.full((8, 2), 50.0), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [demo.ellipse_path(forward_facing_poses(), 3.0, 5), demo.orbit_path(forward_facing_poses()[1:], 5)],
+    ids=["ellipse", "orbit"],
+)
+def test_poses_are_rotations(path):
+    rotations = path[:, :3, :3]
+    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (5, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(rotations), 1.0)
+
+
+def test_camera_path_has_the_photos_lens_and_even_sides():
+    path = demo.camera_path(np.eye(4)[None], (253, 189), focal_over_height=0.85)
+    assert (path["render_width"], path["render_height"]) == (252, 188)
+    cameras = get_path_from_json(path)
+    assert cameras.fx.item() == pytest.approx(0.85 * 188)
+    assert (cameras.cx.item(), cameras.cy.item()) == (126, 94)
+
+
+def test_flight_before_an_llff_scene_is_in_nerfstudios_world(tmp_path):
+    row = np.concatenate([np.c_[np.eye(3), np.zeros(3), (189.0, 252.0, 214.2)].ravel(), (2.0, 8.0)])
+    np.save(tmp_path / "poses_bounds.npy", np.tile(row, (3, 1)))
+    (tmp_path / "scene.json").write_text(json.dumps({"cameras": forward_facing_poses()[:, :3].tolist()}))
+    cameras = get_path_from_json(demo.flight("llff", tmp_path, tmp_path, frames=6))
+    # 1 / (0.25 / 2 + 0.75 / 8) of the file's units, in which the near bound of 2 is 4/3 in nerfstudio's world
+    focus = (0.0, 0.0, -32 / 7 * (4 / 3) / 2)
+    torch.testing.assert_close(seen_at(cameras, focus), torch.tensor([[126.0, 94.0]]).expand(6, 2), atol=1e-3, rtol=0)
+    assert cameras.fx[0].item() == pytest.approx(214.2 / 189 * 188)
+
+
+def append(folder, name):
+    """A stage that adds a line to a file, so that one can count how often it ran."""
+    code = f"open({str(folder / name)!r}, 'a').write('ran\\n')"
+    return demo.Stage(name, f"Writing {name}", [["python", "-c", code]], name)
+
+
+def times_run(folder):
+    return {path.name: len(path.read_text().splitlines()) for path in folder.iterdir() if path.is_file()}
+
+
+def test_finished_stages_are_not_done_again(tmp_path, capsys):
+    stages = [append(tmp_path, "first"), append(tmp_path, "second")]
+    demo.Demo(tmp_path).run(stages)
+    demo.Demo(tmp_path).run(stages)
+    assert times_run(tmp_path) == {"first": 1, "second": 1}
+    assert capsys.readouterr().out.count("done before") == 2
+
+
+def test_force_does_all_again(tmp_path):
+    stages = [append(tmp_path, "first"), append(tmp_path, "second")]
+    demo.Demo(tmp_path).run(stages)
+    demo.Demo(tmp_path, force=True).run(stages)
+    assert times_run(tmp_path) == {"first": 2, "second": 2}
+
+
+def test_changed_settings_and_all_that_follows_are_done_again(tmp_path):
+    first, second, third = (append(tmp_path, name) for name in ("first", "second", "third"))
+    demo.Demo(tmp_path).run([first, second, third])
+    second.settings = "48 frames"
+    demo.Demo(tmp_path).run([first, second, third])
+    assert times_run(tmp_path) == {"first": 1, "second": 2, "third": 2}
+
+
+def test_stage_whose_product_is_gone_is_done_again(tmp_path):
+    stages = [append(tmp_path, "first"), append(tmp_path, "second")]
+    demo.Demo(tmp_path).run(stages)
+    (tmp_path / "first").unlink()
+    demo.Demo(tmp_path).run(stages)
+    assert times_run(tmp_path) == {"first": 1, "second": 2}
+
+
+def test_failed_stage_ends_with_its_last_lines_and_is_done_again(tmp_path):
+    code = "import sys; [print(f'line {i}') for i in range(30)]; sys.exit(3)"
+    failing = demo.Stage("second", "Failing", [["python", "-c", code]], "second")
+    with pytest.raises(demo.StageFailedError) as failure:
+        demo.Demo(tmp_path).run([append(tmp_path, "first"), failing])
+    lines = str(failure.value).splitlines()
+    assert lines[0] == "Failing: python ended with exit status 3; its last lines were"
+    assert [line.strip() for line in lines[1:]] == [f"line {i}" for i in range(10, 30)]
+    demo.Demo(tmp_path).run([append(tmp_path, "first"), append(tmp_path, "second")])
+    assert times_run(tmp_path) == {"first": 1, "second": 1}
+
+
+def test_stage_that_makes_nothing_fails(tmp_path):
+    idle = demo.Stage("idle", "Doing nothing", [["python", "-c", "pass"]], "something")
+    with pytest.raises(demo.StageFailedError, match=r"Doing nothing: it ended without .*something"):
+        demo.Demo(tmp_path).run([idle])
+
+
+def test_program_that_is_missing_is_named(tmp_path):
+    missing = demo.Stage("missing", "Calling", [["no-such-program"]], "something")
+    with pytest.raises(demo.StageFailedError, match="Calling: no-such-program can't be started"):
+        demo.Demo(tmp_path).run([missing])
+
+
+def test_newest_run_is_the_one_configured_last(tmp_path):
+    for age, name in enumerate(("b", "c", "a")):
+        config = tmp_path / "hier-style-draft" / name / "config.yml"
+        config.parent.mkdir(parents=True)
+        config.write_text("")
+        os.utime(config, (age, age))
+    assert demo.newest_run(tmp_path, "hier-style-draft").name == "a"
+    with pytest.raises(demo.StageFailedError, match="no run of coarse-fewshot"):
+        demo.newest_run(tmp_path, "coarse-fewshot")
+
+
+def test_stages_are_the_commands_a_newcomer_would_type(tmp_path):
+    options = demo._parse(["--output", str(tmp_path), "--scene", "blender", "--iterations-coarse", "300"])
+    stages = demo.make_stages(options)
+    coarse, stylised = (shlex.join(stage.commands[0]) for stage in stages[2:4])
+    assert coarse.startswith(f"ns-train coarse-fewshot-draft --data {tmp_path}/scene/blender --output-dir")
+    assert coarse.endswith("--max-num-iterations 300 blender-data")
+    assert stylised.startswith(f"ns-train hier-style-draft --style-image {tmp_path}/style.png --data")
+    assert "--max-num-iterations" not in stylised
+
+
+def test_impossible_option_is_refused(capsys):
+    with pytest.raises(SystemExit) as ended:
+        demo._parse(["--frames", "0"])
+    assert ended.value.code == 2
+    assert "--frames is 0, but has to be at least 1" in capsys.readouterr().err
