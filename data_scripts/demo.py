@@ -13,15 +13,14 @@ import json
 import math
 import os
 import shlex
-import shutil
+import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple, Union
+from typing import Any, Callable, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
@@ -31,6 +30,7 @@ LINES_OF_A_FAILURE = 20
 NEAR_IN_LLFF_WORLD = 4 / 3
 """Distance of the nearest thing seen in the world that the dataparser llff-data lays out (1 / its bound_scale)."""
 COARSE, STYLE = "coarse-fewshot-draft", "hier-style-draft"
+RULE = "─"
 CHECKPOINTS = "outputs/*/{}/*/nerfstudio_models/*.ckpt"
 
 
@@ -186,10 +186,9 @@ class Stage:
 class Demo:
     """Runs stages in a folder, each only where it has to be."""
 
-    def __init__(self, folder: Path, force: bool = False, environment: Optional[Dict[str, str]] = None):
+    def __init__(self, folder: Path, force: bool = False):
         self.folder = folder
         self.force = force
-        self.environment = environment
         self.durations: List[Tuple[str, Optional[float]]] = []
 
     def is_finished(self, stage: Stage) -> bool:
@@ -217,7 +216,7 @@ class Demo:
             self._note(stage).unlink(missing_ok=True)
             start = time.monotonic()
             for command in stage.commands() if callable(stage.commands) else stage.commands:
-                run_command(command, stage.heading, self.environment)
+                run_command(command, stage.heading)
             self.durations.append((stage.heading, time.monotonic() - start))
             if next(self.folder.glob(stage.product), None) is None:
                 raise StageFailedError(f"{stage.heading}: it ended without {self.folder / stage.product}.")
@@ -229,7 +228,7 @@ class Demo:
         return self.folder / ".finished" / stage.name
 
 
-def run_command(command: List[str], heading: str, environment: Optional[Dict[str, str]] = None) -> None:
+def run_command(command: List[str], heading: str) -> None:
     """Runs a command, shows it, and passes on what it prints, with the time since it started before each line.
 
     Ctrl-C reaches the command too; it is given the time to save what it has.
@@ -246,7 +245,7 @@ def run_command(command: List[str], heading: str, environment: Optional[Dict[str
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            env=environment,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", "PYTHONWARNINGS": "ignore"},
             encoding="utf-8",
             errors="replace",
         )
@@ -255,12 +254,14 @@ def run_command(command: List[str], heading: str, environment: Optional[Dict[str
     assert process.stdout is not None
     with process:
         try:
-            for line in process.stdout:
-                if line.strip():
-                    last.append(line.rstrip())
-                    print(f"{clock(time.monotonic() - start)} {last[-1]}", flush=True)
+            for line in without_config(process.stdout):
+                last.append(line)
+                print(f"{clock(time.monotonic() - start)} {line}", flush=True)
         except KeyboardInterrupt:
             print(process.communicate()[0], flush=True)
+            raise
+        except BaseException:
+            process.terminate()
             raise
     if process.returncode != 0:
         tail = "\n".join(f"    {line}" for line in last)
@@ -295,25 +296,18 @@ def newest_run(experiment: Path, method: str) -> Path:
     return newest.parent
 
 
-def child_environment(folder: Path) -> Dict[str, str]:
-    """The environment for the commands: unbuffered output, and an ffmpeg on PATH, which ns-render needs.
+def without_config(lines: Iterable[str]) -> Iterator[str]:
+    """Lines of a command's output without empty ones and without ns-train's 150 lines of configuration.
 
-    Args:
-        folder: where a link to the ffmpeg inside the package imageio-ffmpeg is put, if the machine has none.
+    They lie between a rule with the heading Config and a plain one; the run's config.yml has them too.
     """
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    if shutil.which("ffmpeg") is None:
-        import imageio_ffmpeg
-
-        carried = Path(imageio_ffmpeg.get_ffmpeg_exe())
-        target = folder / ("ffmpeg.exe" if os.name == "nt" else "ffmpeg")
-        try:
-            target.symlink_to(carried)
-        except OSError:  # Windows lets only some users make links
-            shutil.copy(carried, target)
-        environment["PATH"] = f"{folder}{os.pathsep}{environment.get('PATH', '')}"
-        print("There is no ffmpeg on PATH; films are written with the one that imageio-ffmpeg carries.")
-    return environment
+    is_config = False
+    for line in lines:
+        is_rule = line.count(RULE) > 20
+        if is_config or (is_rule and " Config " in line):
+            is_config = not (is_config and is_rule)
+        elif line.strip():
+            yield line.rstrip()
 
 
 def make_stages(options: argparse.Namespace) -> List[Stage]:
@@ -387,11 +381,11 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     """The command line; `arguments` default to the process's own. Returns the exit status."""
     options = _parse(arguments)
     start = time.monotonic()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the command that is under way ends too
     try:
         options.output.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory() as programs:
-            demo = Demo(options.output, options.force, child_environment(Path(programs)))
-            demo.run(make_stages(options))
+        demo = Demo(options.output, options.force)
+        demo.run(make_stages(options))
     except StageFailedError as error:
         print(f"\nError: {error}", file=sys.stderr)
         return 1

@@ -44,7 +44,33 @@ def gallery(
     print(f"The page is {write_page(pictures, output_path, title)}")
 
 
+@exit_on_input_error
+def evaluate(
+    run: Annotated[Path, tyro.conf.Positional],
+    output_path: Path,
+    style_image: Optional[Path] = None,
+) -> None:
+    """Measures a run on the views it hasn't seen.
+
+    Coarse: PSNR, SSIM, LPIPS where its weights are on the machine, and effective samples a ray. Stylised: the coarse
+    field's quality, and style and content loss before and after stylising.
+
+    Args:
+        run: The run's folder or its config.yml.
+        output_path: JSON file to write, in the layout of ns-eval.
+        style_image: Painting to measure a stylised run against, if not the one it was made with.
+    """
+    from sparsestyle_ns.evaluation.held_out import evaluate_run
+    from sparsestyle_ns.gallery import find_config
+
+    report = evaluate_run(find_config(run), output_path, style_image)
+    for name, value in report.means.items():
+        print(f"{name:>20} {value:9.4f}")
+    print(f"{len(report.views)} held-out views; the report is {output_path}")
+
+
 SUBCOMMANDS: Dict[str, Callable[..., Any]] = {
+    "evaluate": evaluate,
     "gallery": gallery,
 }
 

@@ -544,7 +544,7 @@ def _photo(dataset: Any, index: int) -> Pixels:
 
 def _fitted(image: Image.Image) -> Pixels:
     image.thumbnail((LONGEST_SIDE, LONGEST_SIDE), Image.Resampling.LANCZOS)
-    return np.asarray(image)
+    return np.array(image)
 
 
 def _style_picture(path: Optional[Path]) -> Optional[Picture]:

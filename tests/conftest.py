@@ -24,7 +24,6 @@ TINY_STYLE = [
     *("--pipeline.model.occupancy-resolution", "16"),
     *("--pipeline.feature-side", "48"),
     *("--pipeline.warm-start-steps", "2"),
-    *("--pipeline.warm-start-rays", "64"),
 ]
 
 

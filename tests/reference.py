@@ -3,6 +3,7 @@
 No function here shares code with the package; most are loops over Python numbers.
 """
 
+import itertools
 import math
 
 import numpy as np
@@ -91,13 +92,10 @@ def weights(depths):
 
 def distortion(weights, edges):
     """Σ_ij w_i w_j |m_i − m_j| + ⅓ Σ w_i² (s_{i+1} − s_i), all pairs one by one."""
-    middles = [(left + right) / 2 for left, right in zip(edges[:-1], edges[1:], strict=True)]
-    between = sum(
-        wi * wj * abs(mi - mj)
-        for wi, mi in zip(weights, middles, strict=True)
-        for wj, mj in zip(weights, middles, strict=True)
-    )
-    widths = [right - left for left, right in zip(edges[:-1], edges[1:], strict=True)]
+    middles = [(left + right) / 2 for left, right in itertools.pairwise(edges)]
+    placed = list(zip(weights, middles, strict=True))
+    between = sum(wi * wj * abs(mi - mj) for wi, mi in placed for wj, mj in placed)
+    widths = [right - left for left, right in itertools.pairwise(edges)]
     return between + sum(w * w * width for w, width in zip(weights, widths, strict=True)) / 3
 
 
@@ -112,7 +110,7 @@ def inverse_cdf(edges, weights, quantile):
 
 
 def contract(point):
-    """x/2 where the largest coordinate |x| is below 1, else (1 − 1/(2|x|)) x/|x|: mip-NeRF 360's contraction, halved."""
+    """x/2 where the largest coordinate |x| is below 1, else (1 − 1/(2|x|)) x/|x|: mip-NeRF 360's, halved."""
     norm = max(abs(coordinate) for coordinate in point)
     factor = 0.5 if norm < 1 else (1 - 0.5 / norm) / norm
     return [factor * coordinate for coordinate in point]

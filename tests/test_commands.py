@@ -14,6 +14,7 @@ import pytest
 import torch
 import yaml
 from conftest import TINY, TINY_STYLE, ns_train, only_run, run_entrypoint
+from nerfstudio.engine.trainer import Trainer
 
 from sparsestyle_ns.coarse_run import newest_checkpoint
 from sparsestyle_ns.method_configs import method_config
@@ -32,6 +33,18 @@ def render(subcommand: str, run: Path, output: Path, *flags: str) -> None:
     run_entrypoint(
         render.entrypoint, [subcommand, "--load-config", str(run / "config.yml"), "--output-path", str(output), *flags]
     )
+
+
+def press_ctrl_c_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    """Has the user press Ctrl-C in the middle of an iteration."""
+    train_iteration = Trainer.train_iteration
+
+    def press(trainer: Trainer, current: int):
+        if current == step:
+            signal.raise_signal(signal.SIGINT)
+        return train_iteration(trainer, current)
+
+    monkeypatch.setattr(Trainer, "train_iteration", press)
 
 
 def assert_same_state(first: dict, second: dict) -> None:
@@ -168,13 +181,20 @@ def test_ns_eval_writes_the_coarse_fields_quality_for_both_methods(runs: SimpleN
 
 @pytest.mark.parametrize("method", ["coarse-fewshot", "hier-style"])
 def test_a_resumed_run_ends_as_one_that_was_never_stopped(
-    runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path, method: str
+    runs: SimpleNamespace,
+    llff_scene: Path,
+    painting: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    method: str,
 ) -> None:
     flags = TINY
     if method == "hier-style":
         flags = ["--style-image", str(painting), "--coarse-run", str(runs.coarse), *TINY_STYLE]
     ns_train(method, llff_scene, tmp_path / "whole", "--max-num-iterations", "6", *flags)
-    ns_train(method, llff_scene, tmp_path / "first", "--max-num-iterations", "3", *flags)
+    with monkeypatch.context() as patch:
+        press_ctrl_c_at(patch, step=2)
+        ns_train(method, llff_scene, tmp_path / "first", "--max-num-iterations", "6", *flags)
     first = only_run(tmp_path / "first", method)
     resume = ["--load-dir", str(first / "nerfstudio_models"), "--max-num-iterations", "6"]
     ns_train(method, llff_scene, tmp_path / "second", *resume, *flags)
@@ -204,16 +224,7 @@ def test_hier_style_trains_the_coarse_run_itself_where_there_is_none(
 def test_ctrl_c_leaves_a_checkpoint_that_renders(
     llff_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
-
-    get_loss_dict = CoarseFewShotModel.get_loss_dict
-
-    def press_ctrl_c(self, *args, **kwargs):
-        if self.step == 2:
-            signal.raise_signal(signal.SIGINT)
-        return get_loss_dict(self, *args, **kwargs)
-
-    monkeypatch.setattr(CoarseFewShotModel, "get_loss_dict", press_ctrl_c)
+    press_ctrl_c_at(monkeypatch, step=2)
     ns_train("coarse-fewshot", llff_scene, tmp_path / "outputs", "--max-num-iterations", "50", *TINY)
     run = only_run(tmp_path / "outputs", "coarse-fewshot")
     assert load(run)["step"] == 2

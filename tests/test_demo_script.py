@@ -1,29 +1,14 @@
 """The demo's flight looks where it should, and what is finished isn't done again."""
 
-import importlib.util
 import json
 import os
 import shlex
-import sys
-from pathlib import Path
 
+import demo
 import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.camera_paths import get_path_from_json
-
-SCRIPT = Path(__file__).parents[1] / "data_scripts" / "demo.py"
-
-
-def load_script():
-    spec = importlib.util.spec_from_file_location("demo", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["demo"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-demo = load_script()
 
 
 def forward_facing_poses():
@@ -177,6 +162,20 @@ def test_program_that_is_missing_is_named(tmp_path):
     missing = demo.Stage("missing", "Calling", [["no-such-program"]], "something")
     with pytest.raises(demo.StageFailedError, match="Calling: no-such-program can't be started"):
         demo.Demo(tmp_path).run([missing])
+
+
+def test_configuration_that_ns_train_prints_is_left_out():
+    printed = [
+        "Using --data",
+        "─" * 30 + " Config " + "─" * 30,
+        "TrainerConfig(",
+        "",
+        ")",
+        "─" * 60,
+        "",
+        "Saving config",
+    ]
+    assert list(demo.without_config(printed)) == ["Using --data", "Saving config"]
 
 
 def test_newest_run_is_the_one_configured_last(tmp_path):

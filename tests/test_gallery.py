@@ -2,7 +2,9 @@
 
 import base64
 import io
+import json
 import re
+import shutil
 from html.parser import HTMLParser
 
 import numpy as np
@@ -14,6 +16,7 @@ from sparsestyle_ns.gallery import (
     Picture,
     RunPictures,
     View,
+    collect_run,
     data_uri,
     depth_picture,
     find_config,
@@ -236,3 +239,39 @@ def test_depth_picture_is_lighter_where_things_are_nearer():
 def test_depth_picture_of_nothing_is_grey():
     empty = depth_picture(np.full((4, 4, 1), 1e9), np.zeros((4, 4, 1)))
     np.testing.assert_array_equal(empty, np.full((4, 4, 3), 128))
+
+
+def test_collect_run_shows_photos_and_held_out_views_wherever_the_run_is_now(runs, tmp_path, monkeypatch):
+    moved = tmp_path / "elsewhere" / "hier-style" / "renamed"
+    shutil.copytree(runs.style, moved)
+    monkeypatch.chdir(tmp_path)
+    run = collect_run(moved, num_views=2)
+    assert [photo.caption for photo in run.photos] == json.loads((runs.style / "scene.json").read_text())["view_names"]
+    assert len(run.photos) == 3
+    assert [view.name for view in run.views] == ["Held-out view image000.png", "Held-out view image008.png"]
+    assert run.style.caption == "painting.png"
+    for view in run.views:
+        for pixels in (view.photo, view.coarse, view.stylised, view.depth):
+            assert pixels.shape == (24, 32, 3)
+            assert pixels.dtype == np.uint8
+    assert dict(run.settings)["Iterations"] == "3 of 3"
+    assert dict(run.figures)["Mean of"] == "2 views"
+    assert run.subtitle == "hier-style, 3 photos, 3 iterations"
+    assert Page(page_html([run], "A run")).values("src")
+
+
+def test_collect_run_shows_a_run_whose_painting_is_gone(runs, tmp_path):
+    moved = tmp_path / "outputs" / "scene" / "hier-style" / "run"
+    shutil.copytree(runs.style, moved)
+    config = moved / "config.yml"
+    config.write_text(config.read_text().replace("- painting.png", "- gone.png"))
+    run = collect_run(config, num_views=1)
+    assert run.style is None
+    assert "gone.png, is no longer there" in run.style_note
+
+
+def test_collect_run_says_that_a_run_has_no_checkpoint(runs, tmp_path):
+    moved = tmp_path / "outputs" / "scene" / "hier-style" / "run"
+    shutil.copytree(runs.style, moved, ignore=shutil.ignore_patterns("*.ckpt"))
+    with pytest.raises(InputError, match="has no checkpoint yet"):
+        collect_run(moved)

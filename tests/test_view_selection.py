@@ -1,3 +1,5 @@
+import itertools
+
 import pytest
 
 from sparsestyle_ns.errors import InputError
@@ -52,7 +54,7 @@ def test_evenly_spaced_views_are_distinct_ascending_and_reach_both_ends(count, n
     assert views[0] >= 0 and views[-1] < count
     if 1 < num_views <= count:
         assert (views[0], views[-1]) == (0, count - 1)
-        gaps = [right - left for left, right in zip(views[:-1], views[1:], strict=True)]
+        gaps = [right - left for left, right in itertools.pairwise(views)]
         assert max(gaps) - min(gaps) <= 1
 
 

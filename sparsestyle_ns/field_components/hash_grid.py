@@ -114,7 +114,7 @@ def scatter_matrix(location: GridLocation, rows: int) -> Tensor:
     order = torch.argsort(indices, stable=True)
     starts = F.pad(torch.cumsum(torch.bincount(indices, minlength=rows), dim=0), (1, 0))
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        warnings.filterwarnings("ignore", message="Sparse (CSR tensor support is in beta|invariant checks)")
         return torch.sparse_csr_tensor(
             starts.int(),
             (order // 8).int(),

@@ -69,10 +69,8 @@ class HierStylePipelineConfig(VanillaPipelineConfig):
     """T, the iterations in which it falls."""
     palette_transfer: bool = True
     """Whether photos are given the painting's colours before stylising (ARF, Sec. 4)."""
-    warm_start_steps: int = 100
-    """Steps, before the first iteration, in which c_f is fitted to the photos; 0 is the paper's start from grey."""
-    warm_start_rays: int = 4096
-    """Rays a warm start step."""
+    warm_start_steps: int = 60
+    """Steps, before the first iteration, in which c_f is fitted to whole photos; 0 is the paper's start from grey."""
     novel_views: int = 0
     """Views between the photos to stylise as well, with the coarse render as their content."""
     samples_per_chunk: int = 1 << 18
@@ -240,17 +238,12 @@ class HierStylePipeline(CheckedPipeline):
         The features of VGG's third block hardly see colour; stylising from grey loses the palette. The paper doesn't do
         this.
         """
-        pixels = self.datamanager.pixels
-        target = torch.cat([view.picture.reshape(-1, 3) for view in self.views[: len(pixels.sizes)]])
+        photos = self.views[: len(self.datamanager.pixels.sizes)]
         optimizer = torch.optim.Adam(self.model.residual.parameters(), lr=WARM_START_LEARNING_RATE, fused=True)
-        generator = torch.Generator(device=self.device).manual_seed(self.datamanager.config.seed)
-        for _ in track(range(self.config.warm_start_steps), description="Warm start", transient=True):
-            pick = torch.randint(
-                len(pixels.trusted), (self.config.warm_start_rays,), generator=generator, device=self.device
-            )
-            rows = pixels.trusted[pick]
-            frozen = self.model.freeze(pixels.origins[rows], pixels.directions[rows])
-            loss = reconstruction_loss(self.model.stylised(frozen, coarse_geometry=True).rgb, target[rows])
+        for step in track(range(self.config.warm_start_steps), description="Warm start", transient=True):
+            view = photos[step % len(photos)]
+            colors = view.frozen.render(lambda chunk: self.model.stylised(chunk, coarse_geometry=True).rgb)
+            loss = reconstruction_loss(colors, view.picture.view(-1, 3))
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
