@@ -82,7 +82,7 @@ class _GatherSum(torch.autograd.Function):
         bags = (points * levels, corners)
         weights = location.weights.to(table.dtype).reshape(bags)
         sums = F.embedding_bag(location.indices.reshape(bags), table, per_sample_weights=weights, mode="sum")
-        return sums.view(points, -1)
+        return sums.view(points, levels * table.shape[-1])
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> Tuple[Tensor, None]:
@@ -168,4 +168,4 @@ class HashGrid(FieldComponent):
     def forward(self, in_tensor: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch encoded"]:
         """ψ(x) at positions in [0, 1]³."""
         flat = self.interpolate(self.locate(in_tensor.reshape(-1, 3)))
-        return flat.view(*in_tensor.shape[:-1], -1)
+        return flat.view(*in_tensor.shape[:-1], self.get_out_dim())

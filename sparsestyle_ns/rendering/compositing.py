@@ -18,14 +18,21 @@ interval is infinite."""
 
 
 def optical_depth(density: Float[Tensor, "*batch"], interval: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """τ = σ δ, capped at `MAX_OPTICAL_DEPTH`. An infinite interval gives 0 where the density is 0."""
-    finite = interval.clamp(max=torch.finfo(interval.dtype).max ** 0.5)
-    return (density * finite).clamp(max=MAX_OPTICAL_DEPTH)
+    """τ = σ δ, capped at `MAX_OPTICAL_DEPTH`.
+
+    An infinite interval gives the cap, and 0 where the density is 0. Its gradient is that of an interval of length 1: the
+    true one, infinite at σ = 0, would drown all others once a last sample has been emptied.
+    """
+    infinite = interval.isinf()
+    depth = (density * torch.where(infinite, 1.0, interval)).clamp(max=MAX_OPTICAL_DEPTH)
+    opaque = torch.where(density > 0, MAX_OPTICAL_DEPTH, 0.0).to(depth)
+    return torch.where(infinite, depth + (opaque - depth).detach(), depth)
 
 
 def dense_weights(depth: Float[Tensor, "*rays samples"]) -> Float[Tensor, "*rays samples"]:
     """w_i = T_i (1 − exp(−τ_i)) from optical depths τ ≥ 0, dense layout (NeRF, Eq. 3)."""
-    transmittance = torch.exp(-(torch.cumsum(depth, dim=-1) - depth))
+    in_front = torch.cumsum(torch.cat([torch.zeros_like(depth[..., :1]), depth[..., :-1]], dim=-1), dim=-1)
+    transmittance = torch.exp(-in_front)
     return transmittance * -torch.expm1(-depth)
 
 
@@ -35,13 +42,13 @@ def packed_transmittance(
     """T_i = exp(−Σ τ_j over the samples in front of i on the same ray), packed layout.
 
     The running sum goes over all rays in float64, and each ray's start is taken off: with τ capped, the error of that
-    difference is below 1e-9 for ten million samples.
+    difference stays below 1e-6 for ten million samples.
     """
     running = torch.cumsum(depth.double(), dim=0)
     counts = torch.bincount(ray_indices, minlength=num_rays)
-    before_ray = torch.cat([running.new_zeros(1), running])[torch.cumsum(counts, dim=0) - counts]
-    in_front = running - depth.double() - before_ray[ray_indices]
-    return torch.exp(-in_front.clamp(min=0.0)).to(depth.dtype)
+    before = torch.cat([running.new_zeros(1), running])
+    in_front = before[:-1] - before[torch.cumsum(counts, dim=0) - counts][ray_indices]
+    return torch.exp(-in_front).to(depth.dtype)
 
 
 def packed_weights(

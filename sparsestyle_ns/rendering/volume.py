@@ -56,7 +56,7 @@ def over_background(
 def mean_position(weights: Float[Tensor, "rays samples"], s: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays 1"]:
     """Σ w s / Σ w; 1, the segment's end, where a ray has no weight."""
     total = weights.sum(dim=-1, keepdim=True)
-    return torch.where(total > 0, (weights * s).sum(dim=-1, keepdim=True) / total.clamp(min=1e-10), 1.0)
+    return torch.where(total > 1e-10, (weights * s).sum(dim=-1, keepdim=True) / total.clamp(min=1e-10), 1.0)
 
 
 def render_coarse(
@@ -161,7 +161,7 @@ def render_packed(
     weights = packed_weights(optical_depth(density, samples.lengths), samples.ray_indices, num_rays)[:, None]
     values = torch.cat([color, torch.ones_like(weights), samples.s[:, None]], dim=-1)
     rgb, accumulation, moment = packed_sum(weights * values, samples.ray_indices, num_rays).split([3, 1, 1], dim=-1)
-    s = torch.where(accumulation > 0, moment / accumulation.clamp(min=1e-10), 1.0)
+    s = torch.where(accumulation > 1e-10, moment / accumulation.clamp(min=1e-10), 1.0)
     return PackedRender(over_background(rgb, accumulation, background), accumulation, s)
 
 

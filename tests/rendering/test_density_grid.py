@@ -79,6 +79,13 @@ def test_samples_gather_where_the_grid_is_dense():
     assert inside >= 0.8 * 100
 
 
+def test_the_bins_before_and_behind_a_surface_get_as_many_samples_as_its_own():
+    edges = slabs(16, {10: 1e4}).place_samples(along_x(), 96, 16, unbounded=False, even_share=0.25)[0]
+    # Three quarters of 96 samples for three bins, and one and a half for every bin from the even share.
+    counts = torch.histc(0.5 * (edges[1:] + edges[:-1]), bins=16, min=0, max=1)
+    assert counts[9:12].tolist() == pytest.approx([24 + 1.5] * 3, abs=1)
+
+
 def test_what_is_hidden_gets_no_more_than_the_even_share():
     edges = slabs(16, {3: 1000.0, 12: 1000.0}).place_samples(along_x(), 100, 64, unbounded=False, even_share=0.2)[0]
     hidden = ((edges > 0.7) & (edges <= 0.9)).sum()
