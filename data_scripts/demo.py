@@ -12,21 +12,25 @@ import argparse
 import json
 import math
 import os
+import queue
 import shlex
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
+from typing import IO, Any, Callable, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
 SCRIPTS = Path(__file__).resolve().parent
 FRAMES_PER_SECOND = 12
 LINES_OF_A_FAILURE = 20
+SILENCE = 20.0
+"""Seconds after which a command that prints nothing is said to be still running."""
 NEAR_IN_LLFF_WORLD = 4 / 3
 """Distance of the nearest thing seen in the world that the dataparser llff-data lays out (1 / its bound_scale)."""
 COARSE, STYLE = "coarse-fewshot-draft", "hier-style-draft"
@@ -129,7 +133,7 @@ def camera_path(poses: np.ndarray, size: Tuple[int, int], focal_over_height: flo
     }
 
 
-def flight(layout: str, scene: Path, run: Path, frames: int) -> Dict[str, Any]:
+def flight(layout: str, scene: Path, run: Path, frames: int, longer_side: int) -> Dict[str, Any]:
     """The camera path for a run on a sample scene.
 
     Args:
@@ -137,6 +141,7 @@ def flight(layout: str, scene: Path, run: Path, frames: int) -> Dict[str, Any]:
         scene: the scene's folder, which knows the photos' size and focal length.
         run: the run's folder, whose scene.json knows where its cameras stand in nerfstudio's world.
         frames: how many.
+        longer_side: of a frame in pixels; the other one follows from the photos'.
     """
     cameras = np.array(json.loads((run / "scene.json").read_text())["cameras"])
     if layout == "blender":
@@ -146,13 +151,15 @@ def flight(layout: str, scene: Path, run: Path, frames: int) -> Dict[str, Any]:
         with Image.open(sorted((scene / "train").glob("*.png"))[0]) as photo:
             size = photo.size
         focal = 0.5 * size[0] / math.tan(0.5 * transforms["camera_angle_x"])
-        return camera_path(orbit_path(cameras, frames), size, focal / size[1])
-    rows = np.load(scene / "poses_bounds.npy")
-    height, width, focal = rows[0, :15].reshape(3, 5)[:, 4]
-    near, far = rows[:, 15].min(), rows[:, 16].max()
-    # As LLFF's own flights: nearer to the front of the scene than to its back, which hardly moves anyway.
-    focus = NEAR_IN_LLFF_WORLD / near / (0.25 / near + 0.75 / far)
-    return camera_path(ellipse_path(cameras, focus, frames), (round(width), round(height)), focal / height)
+        poses = orbit_path(cameras, frames)
+    else:
+        rows = np.load(scene / "poses_bounds.npy")
+        *size, focal = rows[0, :15].reshape(3, 5)[[1, 0, 2], 4]
+        near, far = rows[:, 15].min(), rows[:, 16].max()
+        # As LLFF's own flights: nearer to the front of the scene than to its back, which hardly moves anyway.
+        poses = ellipse_path(cameras, NEAR_IN_LLFF_WORLD / near / (0.25 / near + 0.75 / far), frames)
+    width, height = (round(side * longer_side / max(size)) for side in size)
+    return camera_path(poses, (width, height), focal / size[1])
 
 
 # ---------------------------------------------------------------------------------------------------------- the stages
@@ -252,13 +259,19 @@ def run_command(command: List[str], heading: str) -> None:
     except OSError as error:
         raise StageFailedError(f"{heading}: {command[0]} can't be started ({error.strerror}).") from error
     assert process.stdout is not None
+
+    def show(text: str) -> None:
+        print(f"{clock(time.monotonic() - start)} {text}", flush=True)
+
+    printed = read_lines(process.stdout)
     with process:
         try:
-            for line in without_config(process.stdout):
+            for line in without_config(lines_of(printed, show)):
                 last.append(line)
-                print(f"{clock(time.monotonic() - start)} {line}", flush=True)
+                show(line)
         except KeyboardInterrupt:
-            print(process.communicate()[0], flush=True)
+            for line in without_config(lines_of(printed, show)):
+                show(line)
             raise
         except BaseException:
             process.terminate()
@@ -296,6 +309,32 @@ def newest_run(experiment: Path, method: str) -> Path:
     return newest.parent
 
 
+def read_lines(stream: IO[str]) -> "queue.Queue[Optional[str]]":
+    """Reads a stream in the background into a queue, which ends with None."""
+    lines: queue.Queue[Optional[str]] = queue.Queue()
+
+    def read() -> None:
+        for line in stream:
+            lines.put(line)
+        lines.put(None)
+
+    threading.Thread(target=read, daemon=True).start()
+    return lines
+
+
+def lines_of(lines: "queue.Queue[Optional[str]]", show: Callable[[str], None]) -> Iterator[str]:
+    """The queue's lines as they come; after a while without any, says through `show` that there is no need to worry."""
+    while True:
+        try:
+            line = lines.get(timeout=SILENCE)
+        except queue.Empty:
+            show("still running …")
+            continue
+        if line is None:
+            return
+        yield line
+
+
 def without_config(lines: Iterable[str]) -> Iterator[str]:
     """Lines of a command's output without empty ones and without ns-train's 150 lines of configuration.
 
@@ -323,7 +362,9 @@ def make_stages(options: argparse.Namespace) -> List[Stage]:
 
     def render() -> List[List[str]]:
         run, path = newest_run(outputs / scene.name, STYLE), folder / "camera_path.json"
-        path.write_text(json.dumps(flight(options.scene, scene, run, options.frames), indent=1) + "\n")
+        path.write_text(
+            json.dumps(flight(options.scene, scene, run, options.frames, options.film_side), indent=1) + "\n"
+        )
         command = ["ns-render", "camera-path", "--load-config", str(run / "config.yml")]
         command += ["--camera-path-filename", str(path), "--rendered-output-names", "rgb", "--output-path", str(film)]
         pictures = [[*command, "--output-format", "images", "--image-format", "png"]] if options.images else []
@@ -334,7 +375,7 @@ def make_stages(options: argparse.Namespace) -> List[Stage]:
         command = ["sparsestyle", "gallery", str(run), "--output-path", str(page), "--video", str(film)]
         return [[*command, "--title", "A few photos and a painting"]]
 
-    rendering = f"{options.frames} frames" + ", also as pictures" * options.images
+    rendering = f"{options.frames} frames of {options.film_side} pixels" + ", also as pictures" * options.images
     return [
         Stage("scene", "Photographing a sample scene", [make_scene], f"scene/{scene.name}/*"),
         Stage("style", "Painting a style image", [make_style], style.name),
@@ -365,15 +406,16 @@ def _parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:
         "--scene", choices=("llff", "blender"), default="llff", help="a still life, or objects seen from all around"
     )
     parser.add_argument("--frames", type=int, default=36, help=f"frames of the film, {FRAMES_PER_SECOND} a second")
+    parser.add_argument("--film-side", type=int, default=128, help="longer side of its frames in pixels (default: 128)")
     parser.add_argument("--images", action="store_true", help="also write the film's frames as PNG files")
     parser.add_argument("--iterations-coarse", type=int, help="iterations of stage 1 (default: the draft's own)")
     parser.add_argument("--iterations-style", type=int, help="iterations of stage 2 (default: the draft's own)")
     parser.add_argument("--force", action="store_true", help="do all again, finished or not")
     options = parser.parse_args(arguments)
-    for name in ("frames", "iterations_coarse", "iterations_style"):
+    for name, least in (("frames", 1), ("film_side", 16), ("iterations_coarse", 1), ("iterations_style", 1)):
         value = getattr(options, name)
-        if value is not None and value < 1:
-            parser.error(f"--{name.replace('_', '-')} is {value}, but has to be at least 1")
+        if value is not None and value < least:
+            parser.error(f"--{name.replace('_', '-')} is {value}, but has to be at least {least}")
     return options
 
 

@@ -40,7 +40,10 @@ def gallery(
         read_video(path)
     prepare_folder(output_path)  # rendering takes minutes, so what can fail without it fails before
     videos = [*video, *[None] * (len(runs) - len(video))]
-    pictures = [collect_run(config, path, num_views) for config, path in zip(configs, videos, strict=True)]
+    pictures = []
+    for config, path in zip(configs, videos, strict=True):
+        print(f"Rendering views of {config.parent} …", flush=True)
+        pictures.append(collect_run(config, path, num_views))
     print(f"The page is {write_page(pictures, output_path, title)}")
 
 

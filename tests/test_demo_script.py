@@ -1,14 +1,18 @@
 """The demo's flight looks where it should, and what is finished isn't done again."""
 
+import importlib
 import json
 import os
 import shlex
 
-import demo
 import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.camera_paths import get_path_from_json
+from PIL import Image
+
+# The demo makes a folder of the same name, and ruff would sort `import demo` by whether it is there.
+demo = importlib.import_module("demo")
 
 
 def forward_facing_poses():
@@ -92,11 +96,22 @@ def test_flight_before_an_llff_scene_is_in_nerfstudios_world(tmp_path):
     row = np.concatenate([np.c_[np.eye(3), np.zeros(3), (189.0, 252.0, 214.2)].ravel(), (2.0, 8.0)])
     np.save(tmp_path / "poses_bounds.npy", np.tile(row, (3, 1)))
     (tmp_path / "scene.json").write_text(json.dumps({"cameras": forward_facing_poses()[:, :3].tolist()}))
-    cameras = get_path_from_json(demo.flight("llff", tmp_path, tmp_path, frames=6))
+    cameras = get_path_from_json(demo.flight("llff", tmp_path, tmp_path, frames=6, longer_side=252))
     # 1 / (0.25 / 2 + 0.75 / 8) of the file's units, in which the near bound of 2 is 4/3 in nerfstudio's world
     focus = (0.0, 0.0, -32 / 7 * (4 / 3) / 2)
     torch.testing.assert_close(seen_at(cameras, focus), torch.tensor([[126.0, 94.0]]).expand(6, 2), atol=1e-3, rtol=0)
     assert cameras.fx[0].item() == pytest.approx(214.2 / 189 * 188)
+
+
+def test_flight_around_a_blender_scene_has_its_pictures_shape_and_angle(tmp_path):
+    (tmp_path / "train").mkdir()
+    Image.new("RGBA", (60, 40)).save(tmp_path / "train" / "r_0.png")
+    (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": np.pi / 2}))
+    poses = demo.orbit_path(forward_facing_poses()[1:], 3)
+    (tmp_path / "scene.json").write_text(json.dumps({"cameras": poses[:, :3].tolist()}))
+    path = demo.flight("blender", tmp_path, tmp_path, frames=4, longer_side=30)
+    assert (path["render_width"], path["render_height"]) == (30, 20)
+    assert get_path_from_json(path).fx[0].item() == pytest.approx(15.0)
 
 
 def append(folder, name):
@@ -176,6 +191,14 @@ def test_configuration_that_ns_train_prints_is_left_out():
         "Saving config",
     ]
     assert list(demo.without_config(printed)) == ["Using --data", "Saving config"]
+
+
+def test_silent_command_is_said_to_be_running(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(demo, "SILENCE", 0.2)
+    demo.run_command(["python", "-c", "import time; time.sleep(1); print('awake')"], "Sleeping")
+    lines = [line.split(maxsplit=1)[1] for line in capsys.readouterr().out.splitlines()]
+    assert lines[1:].count("still running …") >= 2
+    assert lines[-1] == "awake"
 
 
 def test_newest_run_is_the_one_configured_last(tmp_path):

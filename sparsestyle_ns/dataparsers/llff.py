@@ -36,6 +36,8 @@ IMAGE_MODES = ("L", "RGB", "RGBA")
 """Pillow's names of the pixel formats that nerfstudio reads as they are meant."""
 NDC_NEAR = 1.0
 """Distance of NDC's near plane in the scaled world."""
+DEPTH_MARGIN = 0.1
+"""Share by which the bounds of depth are widened: LLFF's are percentiles of sparse points."""
 BOX_MARGIN = 0.05
 """How far the scene box reaches beyond what the cameras see, on each side, as a part of its width."""
 
@@ -81,6 +83,7 @@ class LLFFDataParser(DataParser):
     - `space`: "ndc": the scene box is in NDC, and rays are to be mapped there (`rendering/ndc.py`);
     - `ndc_focal_over_half_size`: (2f/w, 2f/h), and `ndc_near`: 1.0, the arguments of that map;
     - `view_ids` and `view_names`: which of the sorted images this split has, and their file names;
+    - `ndc_depth_range`: depth of the nearest and the farthest thing that any view sees, with a margin;
     - `bounds`: [num_views_of_split, 2], near and far bound of each view in the scaled world's units.
     """
 
@@ -132,6 +135,7 @@ class LLFFDataParser(DataParser):
                 "space": "ndc",
                 "ndc_focal_over_half_size": focal_over_half_size,
                 "ndc_near": NDC_NEAR,
+                "ndc_depth_range": depth_range(scale * llff_cameras.bounds),
                 "view_ids": view_ids,
                 "view_names": [filenames[i].name for i in view_ids],
                 "bounds": (scale * llff_cameras.bounds[view_ids]).float(),
@@ -357,6 +361,11 @@ def recentring_transform(camera_to_worlds: Float[Tensor, "num_views 3 4"]) -> Fl
     right, back = F.normalize(right, dim=0), F.normalize(back, dim=0)
     world_to_average = torch.stack([right, torch.linalg.cross(back, right), back])
     return torch.cat([world_to_average, -world_to_average @ position[:, None]], dim=-1)
+
+
+def depth_range(bounds: Float[Tensor, "num_views 2"]) -> Tuple[float, float]:
+    """Depths between which all of a scene lies: the views' extreme bounds, widened by `DEPTH_MARGIN` of each."""
+    return (1 - DEPTH_MARGIN) * bounds[:, 0].min().item(), (1 + DEPTH_MARGIN) * bounds[:, 1].max().item()
 
 
 def ndc_scene_box(

@@ -18,7 +18,7 @@ from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.rendering.compositing import distortion, effective_samples
 from sparsestyle_ns.rendering.density_grid import DensityGrid
 from sparsestyle_ns.rendering.precision import Precision, autocast
-from sparsestyle_ns.rendering.sampling import even_edges, jitter_directions
+from sparsestyle_ns.rendering.sampling import even_edges
 from sparsestyle_ns.rendering.space import Segments, make_space
 from sparsestyle_ns.rendering.volume import DenseRender, render_coarse
 
@@ -35,12 +35,13 @@ class CoarseFieldConfig:
     """Units in a hidden layer."""
     feature_dim: int = 64
     """Length of the geometric feature e_c."""
-    direction_levels: Optional[int] = 4
-    """Octaves of the view direction's encoding; None for colour that doesn't depend on the view."""
+    direction_levels: Optional[int] = None
+    """Octaves of the view direction's encoding: 4 for the paper's F_c(γ(x), d). None for colour that doesn't depend on
+    the view: three photos can't tell shine from shape (README, Where we depart from the paper)."""
     density_activation: DensityActivation = "exp"
     """What keeps the density positive. exp finds surfaces sooner than softplus (README, Where the paper is silent)."""
-    density_bias: float = 0.0
-    """Added to the density's logit."""
+    density_bias: float = 1.0
+    """Added to the density's logit: a field that starts as dense fog is less drawn to the far end of its rays."""
 
     def setup(self) -> CoarseField:
         """The field."""
@@ -68,15 +69,12 @@ class CoarseFewShotModelConfig(ModelConfig):
     """Share of guided samples, in (0, 1], that is spread evenly."""
     grid_resolution: int = 64
     """Cells along a side of the grid that remembers density."""
-    distortion_weight: float = 0.02
+    distortion_weight: float = 0.005
     """Weight of the distortion loss, which gathers a ray's weight in one place; 0 is off, as in the paper."""
     distortion_start: float = 0.4
     """Share of the iterations after which the distortion loss sets in."""
     distortion_ramp: float = 0.3
     """Share of the iterations, above 0, in which it then grows to its weight."""
-    direction_noise: float = 2.0
-    """Spread of the noise that is added to view directions in training, which are of length 1: few photos can't tell
-    what is shine and what is shape. 0 is off, as in the paper."""
     occlusion_weight: float = 0.0
     """Weight of density close to the camera (FreeNeRF's occlusion loss); 0 is off."""
     occlusion_range: float = 0.1
@@ -137,9 +135,8 @@ class CoarseFewShotModel(Model):
         since = self.step / self.num_steps - self.config.distortion_start
         return min(1.0, max(0.0, since / self.config.distortion_ramp))
 
-    def _generator(self, stream: int) -> torch.Generator:
-        seed = (self.config.seed * 1_000_003 + self.step) * 2 + stream
-        return torch.Generator(device=self.device).manual_seed(seed)
+    def _generator(self) -> torch.Generator:
+        return torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + self.step)
 
     def place_samples(self, segments: Segments, num_samples: int, generator: Optional[torch.Generator]) -> Tensor:
         """Borders of samples on rays, as the setting `sampling` says."""
@@ -155,11 +152,10 @@ class CoarseFewShotModel(Model):
         """Renders rays; also returns their segments and the samples' borders."""
         segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
         edges = self.place_samples(segments, num_samples, generator)
-        directions = ray_bundle.directions
-        if self.training and self.config.direction_noise > 0:
-            directions = jitter_directions(directions, self.config.direction_noise, self._generator(1))
         with autocast(self.device, self.config.precision):
-            render = render_coarse(self.field, segments, directions, edges, self.space.unbounded, self.background)
+            render = render_coarse(
+                self.field, segments, ray_bundle.directions, edges, self.space.unbounded, self.background
+            )
         return render, segments, edges
 
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
@@ -168,7 +164,7 @@ class CoarseFewShotModel(Model):
             render, segments, _ = self.render(ray_bundle, self.config.num_eval_samples, None)
             depth = segments.distance(render.s.clamp(max=1.0 - 1e-4))
             return {"rgb": render.rgb, "accumulation": render.accumulation, "depth": depth}
-        render, _, edges = self.render(ray_bundle, self.config.num_samples, self._generator(0))
+        render, _, edges = self.render(ray_bundle, self.config.num_samples, self._generator())
         if self.grid is not None:
             self.grid.remember(render.positions, render.density)
         return {

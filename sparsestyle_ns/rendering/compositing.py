@@ -20,8 +20,8 @@ interval is infinite."""
 def optical_depth(density: Float[Tensor, "*batch"], interval: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """τ = σ δ, capped at `MAX_OPTICAL_DEPTH`.
 
-    An infinite interval gives the cap, and 0 where the density is 0. Its gradient is that of an interval of length 1: the
-    true one, infinite at σ = 0, would drown all others once a last sample has been emptied.
+    An infinite interval gives the cap, and 0 where the density is 0. Its gradient is that of an interval of length 1:
+    the true one, infinite at σ = 0, would drown all others once a last sample has been emptied.
     """
     infinite = interval.isinf()
     depth = (density * torch.where(infinite, 1.0, interval)).clamp(max=MAX_OPTICAL_DEPTH)

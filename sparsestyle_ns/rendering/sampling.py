@@ -51,11 +51,3 @@ def edges_from_histogram(
     fraction = (quantiles - cdf_left) / (cdf_right - cdf_left).clamp(min=torch.finfo(cdf.dtype).eps)
     inner = edge_left + fraction.clamp(0.0, 1.0) * (edge_right - edge_left)
     return torch.cat([edges[:, :1], inner, edges[:, -1:]], dim=-1)
-
-
-def jitter_directions(
-    directions: Float[Tensor, "rays 3"], spread: float, generator: torch.Generator
-) -> Float[Tensor, "rays 3"]:
-    """Unit directions with normal noise of standard deviation `spread` added, scaled back to length 1."""
-    noise = torch.randn(directions.shape, device=directions.device, generator=generator)
-    return torch.nn.functional.normalize(directions + spread * noise, dim=-1)

@@ -6,6 +6,7 @@ A space turns rays into segments; s in [0, 1] goes from a segment's start to its
 the cube, so that the scale of the world's coordinates doesn't matter.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Dict, Optional, Tuple
@@ -62,17 +63,18 @@ class LinearSegments(Segments):
 
 @dataclass
 class ForwardFacingSegments(LinearSegments):
-    """Linear segments in NDC, with the world rays they came from."""
+    """Linear segments in NDC, with the world rays they came from; t' runs from `first` to `last`."""
 
     origins: Float[Tensor, "rays 3"]
     directions: Float[Tensor, "rays 3"]
     near: float
+    first: float
+    last: float
 
     def distance(self, s: Tensor) -> Tensor:
         """See `Segments.distance`."""
-        return ndc_distance(s, self.origins, self.directions, self.near, max_distance=MAX_DISTANCE).clamp(
-            max=MAX_DISTANCE
-        )
+        t_ndc = self.first + s * (self.last - self.first)
+        return ndc_distance(t_ndc, self.origins, self.directions, self.near, max_distance=MAX_DISTANCE)
 
 
 @dataclass
@@ -175,18 +177,33 @@ class Space(nn.Module, ABC):
 class ForwardFacingSpace(Space):
     """Normalised device coordinates (NeRF, appendix C), for cameras that all look one way.
 
+    Depth d lies at z' = 1 − 2 near/d. Samples lie between the two depths of `depth_range`; the last one's interval goes
+    on to infinity. Knowing how far away the farthest thing is matters with few photos: all that lies at infinity looks
+    the same from everywhere, so that a field which puts a whole photo there is hard to dislodge.
+
     Args:
-        box: NDC box that holds all views' frusta; it becomes the cube.
+        box: NDC box that holds all views' frusta; between the depths it becomes the cube.
         focal_over_half_size: 2f/width and 2f/height.
         near: distance of the near plane in world units.
+        depth_range: depth of the nearest and of the farthest thing, in world units; None for all from `near` on.
     """
 
     unbounded = True
 
-    def __init__(self, box: SceneBox, focal_over_half_size: Tuple[float, float], near: float) -> None:
+    def __init__(
+        self,
+        box: SceneBox,
+        focal_over_half_size: Tuple[float, float],
+        near: float,
+        depth_range: Optional[Tuple[float, float]] = None,
+    ) -> None:
         super().__init__()
-        self.register_buffer("minimum", box.aabb[0].float().clone())
-        self.register_buffer("maximum", box.aabb[1].float().clone())
+        nearest, farthest = depth_range or (near, math.inf)
+        self.first, self.last = 1.0 - near / max(near, nearest), 1.0 - near / farthest
+        minimum, maximum = box.aabb.float().clone()
+        minimum[2], maximum[2] = 2.0 * self.first - 1.0, 2.0 * self.last - 1.0
+        self.register_buffer("minimum", minimum)
+        self.register_buffer("maximum", maximum)
         self.focal_over_half_size = focal_over_half_size
         self.near = near
 
@@ -196,12 +213,14 @@ class ForwardFacingSpace(Space):
         hit = valid.squeeze(-1)
         scale = 2.0 / (self.maximum - self.minimum)
         return ForwardFacingSegments(
-            start=(start - self.minimum) * scale - 1.0,
-            extent=extent * scale * hit[:, None],
+            start=(start + self.first * extent - self.minimum) * scale - 1.0,
+            extent=(self.last - self.first) * extent * scale * hit[:, None],
             hit=hit,
             origins=origins,
             directions=directions,
             near=self.near,
+            first=self.first,
+            last=self.last,
         )
 
 
@@ -257,7 +276,8 @@ class ContractedSpace(Space):
 def make_space(scene_box: SceneBox, metadata: Dict[str, Any]) -> Space:
     """The space that a dataset's metadata asks for: its key `space` is "ndc", "box" or "contracted"."""
     if metadata["space"] == "ndc":
-        return ForwardFacingSpace(scene_box, tuple(metadata["ndc_focal_over_half_size"]), metadata["ndc_near"])
+        focal_over_half_size, depth_range = metadata["ndc_focal_over_half_size"], metadata["ndc_depth_range"]
+        return ForwardFacingSpace(scene_box, focal_over_half_size, metadata["ndc_near"], depth_range)
     if metadata["space"] == "box":
         return BoxSpace(scene_box)
     return ContractedSpace()

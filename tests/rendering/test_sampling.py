@@ -2,7 +2,7 @@ import pytest
 import reference
 import torch
 
-from sparsestyle_ns.rendering.sampling import edges_from_histogram, even_edges, jitter_directions
+from sparsestyle_ns.rendering.sampling import edges_from_histogram, even_edges
 
 CPU = torch.device("cpu")
 
@@ -96,14 +96,3 @@ def test_borders_are_random_only_with_a_generator():
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
     assert torch.equal(even_edges(4, 8, CPU, generator(5)), even_edges(4, 8, CPU, generator(5)))
-
-
-def test_jittered_directions_stay_unit_vectors_and_turn_by_as_much_as_asked():
-    directions = torch.tensor([[0.0, 0.6, -0.8]]).expand(20000, -1)
-    jittered = jitter_directions(directions, 0.01, generator())
-    torch.testing.assert_close(jittered.norm(dim=-1), torch.ones(20000))
-    # Across a direction the noise has two of its three dimensions: a root mean square of √2 · 0.01, here to 1 %.
-    turned = (jittered - directions).square().sum(dim=-1).mean().sqrt().item()
-    assert turned == pytest.approx(2**0.5 * 0.01, rel=0.02)
-    torch.testing.assert_close(jitter_directions(directions, 0.0, generator()), directions)
-    assert torch.equal(jitter_directions(directions, 0.01, generator()), jittered)

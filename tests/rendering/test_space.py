@@ -222,7 +222,10 @@ def test_spacing_is_even_in_distance_near_by_and_in_disparity_far_away():
 
 def test_the_metadata_of_a_dataset_chooses_its_space():
     scene_box = SceneBox(aabb=BOX)
-    forward = make_space(scene_box, {"space": "ndc", "ndc_focal_over_half_size": [1.5, 2.0], "ndc_near": 0.7})
+    forward = make_space(
+        scene_box,
+        {"space": "ndc", "ndc_focal_over_half_size": [1.5, 2.0], "ndc_near": 0.7, "ndc_depth_range": [1.0, 9.0]},
+    )
     assert isinstance(forward, ForwardFacingSpace) and forward.unbounded
     assert (forward.focal_over_half_size, forward.near) == ((1.5, 2.0), 0.7)
     inside = make_space(scene_box, {"space": "box"})
