@@ -29,13 +29,14 @@ def gallery(
         title: Heading of the page.
         num_views: Held-out views to render of each run.
     """
-    from sparsestyle_ns.gallery import collect_run, find_config, prepare_folder, read_video, write_page
+    from sparsestyle_ns.gallery import collect_run, prepare_folder, read_video, write_page
+    from sparsestyle_ns.run_folder import STYLE_METHOD, find_config
 
     if not runs:
         raise InputError("There is no run to show; name at least one run's folder.")
     if len(video) > len(runs):
         raise InputError(f"There are {len(video)} videos for {len(runs)} runs; give at most one for each run.")
-    configs = [find_config(run) for run in runs]
+    configs = [find_config(run, STYLE_METHOD) for run in runs]
     for path in video:
         read_video(path)
     prepare_folder(output_path)  # rendering takes minutes, so what can fail without it fails before
@@ -64,7 +65,7 @@ def evaluate(
         style_image: Painting to measure a stylised run against, if not the one it was made with.
     """
     from sparsestyle_ns.evaluation.held_out import evaluate_run
-    from sparsestyle_ns.gallery import find_config
+    from sparsestyle_ns.run_folder import find_config
 
     report = evaluate_run(find_config(run), output_path, style_image)
     for name, value in report.means.items():

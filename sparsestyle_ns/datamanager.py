@@ -82,7 +82,9 @@ class FewShotDataManager(VanillaDataManager[InputDataset]):
         self.train_dataparser_outputs = select_outputs(outputs, chosen)
         if self.test_mode == "val":
             names = ", ".join(path.name for path in self.train_dataparser_outputs.image_filenames)
-            CONSOLE.print(f"Training on views {', '.join(map(str, self.view_ids))} of {len(ids)} ({names}).")
+            CONSOLE.print(
+                f"Training on {len(chosen)} of {len(ids)} views: {', '.join(map(str, self.view_ids))} ({names})."
+            )
         return self._dataset(self.train_dataparser_outputs, space)
 
     def create_eval_dataset(self) -> InputDataset:

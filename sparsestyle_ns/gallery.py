@@ -8,7 +8,6 @@ without a network and can be sent as it is. `collect_run` gets a run's pictures 
 import base64
 import io
 import os
-import re
 import tempfile
 from dataclasses import dataclass, field
 from html import escape
@@ -20,9 +19,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageOps
 
 from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.run_folder import STYLE_METHOD, find_config, load_run
 
-STYLE_METHOD = "hier-style"
-"""What the names of the methods whose runs can be shown start with."""
 LONGEST_SIDE = 512
 """Pixels that a picture on the page has at most along its longer side."""
 LOSSLESS_PIXELS = 200_000
@@ -380,29 +378,6 @@ if (matchMedia("(prefers-reduced-motion: reduce)").matches) {
 # --------------------------------------------------------------------------------------------------- a run's pictures
 
 
-def find_config(run: Path) -> Path:
-    """The config.yml of a stylised run, given by its folder or by that file; reads no more than its method's name.
-
-    Raises:
-        InputError: it isn't there, or is no run of a method that stylises.
-    """
-    path = run if run.name == "config.yml" else run / "config.yml"
-    if not path.is_file():
-        what = "There is no run at" if not run.exists() else "There is no config.yml in"
-        raise InputError(
-            f"{what} {run}; name a stylised run's folder, such as outputs/fern/{STYLE_METHOD}/2026-01-31_120000."
-        )
-    try:
-        name = re.search(r"^method_name: *(\S+)", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} can't be read; name the folder of a run that ns-train made.") from error
-    if name is None:
-        raise InputError(f"{path} is no config of a nerfstudio run; name the folder of a run that ns-train made.")
-    if not name[1].startswith(STYLE_METHOD):
-        raise InputError(f"{run} is a run of {name[1]}, which stylises nothing; name a run of {STYLE_METHOD}.")
-    return path
-
-
 def read_video(path: Path) -> bytes:
     """An MP4 file's bytes.
 
@@ -429,11 +404,11 @@ def collect_run(config_path: Path, video: Optional[Path] = None, num_views: int 
     Raises:
         InputError: it isn't a finished run of this package, its photos are gone, or the video can't be read.
     """
-    config_path = find_config(config_path)
+    config_path = find_config(config_path, STYLE_METHOD)
     content = None if video is None else read_video(video)
     if num_views < 1:
         raise InputError(f"--num-views is {num_views}; at least one view is needed.")
-    config, pipeline, step = _load(config_path)
+    config, pipeline, step = load_run(config_path)
     dataset, held_out = pipeline.datamanager.train_dataset, pipeline.datamanager.eval_dataset
     photos = [
         Picture(_photo(dataset, index), path.name)
@@ -452,30 +427,6 @@ def collect_run(config_path: Path, video: Optional[Path] = None, num_views: int 
         figures=_figures(measured),
         settings=_settings(config, dataset, step),
     )
-
-
-def _load(config_path: Path) -> Tuple[Any, Any, int]:
-    """A run's config, its pipeline and the iteration of its checkpoint."""
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    folder = config_path.resolve().parent
-
-    def where_it_is_now(config: Any) -> Any:
-        from sparsestyle_ns.coarse_run import newest_checkpoint
-        from sparsestyle_ns.scene_record import SceneRecord
-
-        if newest_checkpoint(folder / config.relative_model_dir) is None:
-            raise InputError(f"{folder} has no checkpoint yet; train it, or name another run.")
-        # nerfstudio joins these four to find the checkpoints, from the folder that the command was started in.
-        config.output_dir, config.experiment_name = folder.parents[2], folder.parents[1].name
-        config.method_name, config.timestamp = folder.parent.name, folder.name
-        data = config.pipeline.datamanager.data
-        if data is not None and not data.exists():
-            config.pipeline.datamanager.data = Path(SceneRecord.load(folder).data)
-        return config
-
-    config, pipeline, _, step = eval_setup(config_path, test_mode="test", update_config_callback=where_it_is_now)
-    return config, pipeline, step
 
 
 def _render_views(pipeline: Any, dataset: Any, num_views: int) -> Tuple[List[View], List[Dict[str, float]]]:

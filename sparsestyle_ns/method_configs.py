@@ -61,7 +61,7 @@ def _hier_style(draft: bool) -> TrainerConfig:
         steps_per_eval_all_images=0,
         pipeline=HierStylePipelineConfig(
             datamanager=FewShotDataManagerConfig(max_image_side=128 if draft else 1008),
-            model=HierStyleModelConfig(),
+            model=HierStyleModelConfig(num_steps=64, occupancy_resolution=96) if draft else HierStyleModelConfig(),
             feature_side=252 if draft else 504,
         ),
         optimizers={

@@ -3,7 +3,8 @@
 import copy
 import os
 import signal
-from dataclasses import dataclass, field
+import warnings
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Dict, List, Literal, Tuple, Type
 
@@ -54,6 +55,10 @@ class SparseStyleTrainerConfig(TrainerConfig):
                 f"The run can't be saved in {self.get_base_dir()} ({error.strerror}); name a folder that can be "
                 "written to with --output-dir."
             ) from error
+
+
+warnings.filterwarnings("ignore", message="Using a non-tuple sequence", module="nerfstudio")
+warnings.filterwarnings("ignore", message="Sparse invariant checks are implicitly disabled")
 
 
 class SparseStyleTrainer(Trainer):
@@ -134,6 +139,10 @@ class SparseStyleTrainer(Trainer):
         """Commands that use the finished run."""
         return [f"ns-viewer --load-config {config}"]
 
+    def notes(self) -> Dict[str, Any]:
+        """What a checkpoint says beside the state: numbers and words only."""
+        return {}
+
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Saves a checkpoint as nerfstudio does, but never a half-written one: it gets its name when it is whole."""
@@ -146,6 +155,7 @@ class SparseStyleTrainer(Trainer):
             "optimizers": {name: part.state_dict() for name, part in self.optimizers.optimizers.items()},
             "schedulers": {name: part.state_dict() for name, part in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
+            **self.notes(),
         }
         torch.save(without_numpy_scalars(state), unfinished)
         os.replace(unfinished, target)
@@ -210,8 +220,13 @@ class HierStyleTrainer(SparseStyleTrainer):
         else:
             self._adopt_shape_of_checkpoint()
         self._coarse_state = None if run is None else run.model_state()
-        self.config.save_config()
         super().setup(test_mode)
+        self.config.pipeline.backbone = self.pipeline.targets.backbone.description.name
+        self.config.save_config()
+
+    def notes(self) -> Dict[str, Any]:
+        """Which feature network stylised the scene, and where its weights came from."""
+        return {"backbone": asdict(self.pipeline.targets.backbone.description)}
 
     def _load_checkpoint(self) -> None:
         super()._load_checkpoint()

@@ -112,6 +112,9 @@ def test_a_stylised_checkpoint_holds_the_whole_scene_and_nothing_else(runs: Simp
         *(f"_model.residual.{head}_head.{part}" for head in ("color", "density") for part in ("weight", "bias")),
     }
     assert_same_state({key: coarse[key] for key in fields}, {key: style[key] for key in fields})
+    backbone = load(runs.style)["backbone"]
+    assert backbone["name"] in ("vgg16", "vgg16-shift-tolerant")
+    assert len(backbone["sha256"]) == 64
 
 
 def test_a_stylised_run_renders_without_painting_weights_and_coarse_run(

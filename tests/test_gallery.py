@@ -19,7 +19,6 @@ from sparsestyle_ns.gallery import (
     collect_run,
     data_uri,
     depth_picture,
-    find_config,
     page_html,
     read_video,
     write_page,
@@ -188,34 +187,6 @@ def test_folder_that_can_not_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError, match=r"can't be written to .*index.html"):
         write_page([make_run()], tmp_path / "file" / "index.html", "Scenes")
-
-
-@pytest.mark.parametrize("method", ["hier-style", "hier-style-draft"])
-def test_find_config_takes_a_folder_or_its_config(tmp_path, method):
-    config = tmp_path / "config.yml"
-    config.write_text(f"!!python/object:some.Config\nmax_num_iterations: 200\nmethod_name: {method}\n")
-    assert find_config(tmp_path) == find_config(config) == config
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("method_name: coarse-fewshot\n", "a run of coarse-fewshot, which stylises nothing"),
-        ("method_name: nerfacto\n", "a run of nerfacto"),
-        ("shopping: [bread]\n", "is no config of a nerfstudio run"),
-    ],
-)
-def test_find_config_refuses_what_is_no_stylised_run(tmp_path, text, message):
-    (tmp_path / "config.yml").write_text(text)
-    with pytest.raises(InputError, match=message):
-        find_config(tmp_path)
-
-
-def test_find_config_says_what_is_missing(tmp_path):
-    with pytest.raises(InputError, match=r"There is no config\.yml in"):
-        find_config(tmp_path)
-    with pytest.raises(InputError, match="There is no run at"):
-        find_config(tmp_path / "gone")
 
 
 def test_read_video_takes_mp4_only(tmp_path):

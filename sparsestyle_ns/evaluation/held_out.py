@@ -12,15 +12,14 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from rich.progress import track
 from torch import Tensor
 
-from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
-from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 from sparsestyle_ns.rendering.compositing import dense_weights, effective_samples, optical_depth
 from sparsestyle_ns.rendering.density_grid import interval_lengths
 from sparsestyle_ns.rendering.precision import autocast
 from sparsestyle_ns.rendering.sampling import even_edges
+from sparsestyle_ns.run_folder import load_run
 from sparsestyle_ns.style.targets import StyleTargets
 
 EVEN_SAMPLES = 64
@@ -36,12 +35,12 @@ class HeldOutReport:
     means: Dict[str, float]
     views: List[Dict[str, float]]
 
-    def save(self, path: Path, experiment: str, method: str, checkpoint: Path) -> None:
+    def save(self, path: Path, experiment: str, method: str, step: int) -> None:
         """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means."""
         content = {
             "experiment_name": experiment,
             "method_name": method,
-            "checkpoint": str(checkpoint),
+            "step": step,
             "results": self.means,
             "views": self.views,
         }
@@ -118,15 +117,9 @@ def evaluate_run(config_path: Path, output_path: Path, style_image: Optional[Pat
             style losses are left out.
 
     Raises:
-        InputError: the run is of another method.
+        InputError: the run has no checkpoint.
     """
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    config, pipeline, checkpoint, _ = eval_setup(config_path, test_mode="test")
-    if not isinstance(pipeline.model, (CoarseFewShotModel, HierStyleModel)):
-        raise InputError(
-            f"{config_path} is a run of {config.method_name}; only this package's methods can be evaluated."
-        )
+    config, pipeline, step = load_run(config_path)
     targets = None
     settings = config.pipeline
     if isinstance(settings, HierStylePipelineConfig):
@@ -134,5 +127,5 @@ def evaluate_run(config_path: Path, output_path: Path, style_image: Optional[Pat
         if settings.style_image is not None and settings.style_image.is_file():
             targets = settings.load_targets(pipeline.device)
     report = evaluate_held_out(pipeline, targets)
-    report.save(output_path, config.experiment_name, config.method_name, checkpoint)
+    report.save(output_path, config.experiment_name, config.method_name, step)
     return report

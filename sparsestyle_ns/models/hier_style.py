@@ -62,7 +62,7 @@ class HierStyleModelConfig(ModelConfig):
     """Even steps along a ray; those in empty cells are skipped."""
     occupancy_resolution: int = 128
     """Cells along a side of the grid that says what is empty."""
-    min_alpha: float = 1e-2
+    min_alpha: float = 0.03
     """Opacity over a cell's side, in (0, 1), below which the coarse field counts as empty there."""
     min_transmittance: float = 1e-3
     """Share of light left, in (0, 1), below which samples farther along the ray are dropped."""
