@@ -21,14 +21,14 @@ from sparsestyle_ns.trainer import (
 
 def _coarse_fewshot(draft: bool) -> TrainerConfig:
     """Stage 1; the draft is for images of about 128 pixels and two CPU cores."""
-    iterations = 1000 if draft else 50_000
+    iterations = 3000 if draft else 50_000
     return SparseStyleTrainerConfig(
         _target=CoarseFewShotTrainer,
         method_name="coarse-fewshot-draft" if draft else "coarse-fewshot",
         max_num_iterations=iterations,
-        steps_per_save=500 if draft else 5000,
+        steps_per_save=1000 if draft else 5000,
         steps_per_eval_batch=0,
-        steps_per_eval_image=500 if draft else 5000,
+        steps_per_eval_image=1000 if draft else 5000,
         steps_per_eval_all_images=0,
         pipeline=CoarseFewShotPipelineConfig(
             datamanager=FewShotDataManagerConfig(

@@ -73,8 +73,9 @@ class HierStylePipelineConfig(VanillaPipelineConfig):
     """Steps, before the first iteration, in which c_f is fitted to whole photos; 0 is the paper's start from grey."""
     novel_views: int = 0
     """Views between the photos to stylise as well, with the coarse render as their content."""
-    samples_per_chunk: int = 1 << 18
-    """Samples rendered at once: memory is bounded by about 5 KB for each."""
+    samples_per_chunk: int = 1 << 19
+    """Samples rendered at once: memory is bounded by about 5 KB for each. A view of fewer is rendered in one go; the
+    chunks of a larger one are rendered a second time in the backward pass."""
     cache_gigabytes: Optional[float] = None
     """Memory for what never changes of the views; None: a quarter of what is free."""
 
