@@ -146,8 +146,8 @@ class PackedSamples(NamedTuple):
     lengths: Float[Tensor, "samples"]
     positions: Float[Tensor, "samples 3"]
 
-    def select(self, keep: Bool[Tensor, "samples"]) -> "PackedSamples":
-        """The samples where `keep` is true."""
+    def select(self, keep: Tensor) -> "PackedSamples":
+        """Some of the samples, in order, by mask or ascending indices."""
         return PackedSamples(*(part[keep] for part in self))
 
 

@@ -1,10 +1,11 @@
 """Volume rendering of the two fields: segments and fields in, pixels out."""
 
+import math
 from dataclasses import dataclass
-from typing import Optional
+from typing import List, Optional, Tuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestyle_ns.field_components.hash_grid import GridLocation
@@ -44,6 +45,8 @@ class DenseRender:
 
 POINTS_PER_CALL = 1 << 17
 """Points at which a frozen field is evaluated at once; bounds the memory of its hidden layers."""
+SAMPLES_PER_PASS = 6
+"""Samples of a ray that are evaluated before looking whether it goes on."""
 
 
 def over_background(
@@ -126,12 +129,38 @@ def freeze_samples(
     """
     num_rays = len(segments.hit)
     samples = march(segments, occupancy, num_steps, unbounded)
-    parts = [field.density_and_feature(part) for part in samples.positions.split(POINTS_PER_CALL)]
-    density, feature = torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
+    opaque_depth = -math.log(min_transmittance) if min_transmittance > 0 else math.inf
+    index, density, feature = evaluate_front_to_back(field, samples, num_rays, opaque_depth)
+    samples = samples.select(index)
     depth = optical_depth(density, samples.lengths)
     seen = packed_transmittance(depth, samples.ray_indices, num_rays) > min_transmittance
     samples = samples.select(seen)
-    return FrozenSamples(samples, density[seen], feature[seen].float(), residual.locate(samples.positions), num_rays)
+    return FrozenSamples(samples, density[seen], feature[seen], residual.locate(samples.positions), num_rays)
+
+
+def evaluate_front_to_back(
+    field: CoarseField, samples: PackedSamples, num_rays: int, opaque_depth: float
+) -> Tuple[Int[Tensor, "evaluated"], Float[Tensor, "evaluated"], Float[Tensor, "evaluated feature"]]:
+    """σ_c and e_c of packed samples, a few from each ray at a time, until its optical depth reaches `opaque_depth`.
+
+    Returns:
+        Which samples were evaluated, ascending, and σ_c and e_c there. All samples in front of that depth are among
+        them.
+    """
+    on_ray = samples.ray_indices
+    counts = torch.bincount(on_ray, minlength=num_rays)
+    rank = torch.arange(len(on_ray), device=on_ray.device) - (torch.cumsum(counts, dim=0) - counts)[on_ray]
+    depth = samples.s.new_zeros(num_rays)
+    found: List[Tuple[Tensor, Tensor, Tensor]] = []
+    for first in range(0, max(1, int(counts.max())), SAMPLES_PER_PASS):
+        in_pass = (rank >= first) & (rank < first + SAMPLES_PER_PASS) & (depth < opaque_depth)[on_ray]
+        for index in in_pass.nonzero().squeeze(-1).split(POINTS_PER_CALL):
+            density, feature = field.density_and_feature(samples.positions[index])
+            depth.index_add_(0, on_ray[index], optical_depth(density, samples.lengths[index]))
+            found.append((index, density, feature.float()))
+    index, density, feature = (torch.cat(parts) for parts in zip(*found, strict=True))
+    order = torch.argsort(index)
+    return index[order], density[order], feature[order]
 
 
 def accumulation_of(frozen: FrozenSamples) -> Float[Tensor, "rays 1"]:

@@ -9,6 +9,7 @@ from nerfstudio.data.scene_box import SceneBox
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
+from sparsestyle_ns.rendering.compositing import optical_depth, packed_transmittance
 from sparsestyle_ns.rendering.density_grid import Occupancy
 from sparsestyle_ns.rendering.sampling import even_edges
 from sparsestyle_ns.rendering.space import BoxSpace, ContractedSpace
@@ -178,6 +179,20 @@ def test_dropping_samples_behind_a_surface_changes_a_picture_by_no_more_than_the
     assert 0 < len(cut.density) < len(whole.density)
     difference = (render_stylised(residual, cut, None).rgb - render_stylised(residual, whole, None).rgb).abs().max()
     assert 0 < difference <= 0.05
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("min_transmittance", [0.5, 0.05, 1e-3])
+def test_stopping_rays_early_leaves_exactly_the_samples_that_light_reaches(coarse, residual, rays, min_transmittance):
+    coarse.density_bias = 2.0
+    whole = freeze(coarse, residual, rays)
+    depth = optical_depth(whole.density, whole.samples.lengths)
+    reached = packed_transmittance(depth, whole.samples.ray_indices, whole.num_rays) > min_transmittance
+    early = freeze(coarse, residual, rays, min_transmittance=min_transmittance)
+    assert torch.equal(early.samples.s, whole.samples.s[reached])
+    assert torch.equal(early.samples.ray_indices, whole.samples.ray_indices[reached])
+    torch.testing.assert_close(early.density, whole.density[reached])
+    torch.testing.assert_close(early.feature, whole.feature[reached])
 
 
 def test_no_gradient_reaches_the_frozen_field(coarse, residual, rays):
