@@ -88,8 +88,11 @@ class FewShotDataManager(VanillaDataManager[InputDataset]):
         return self._dataset(self.train_dataparser_outputs, space)
 
     def create_eval_dataset(self) -> InputDataset:
-        """The dataparser's whole held-out split."""
+        """The dataparser's whole held-out split; the training views where it holds out none, as of very few photos."""
         outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
+        if not outputs.image_filenames:
+            CONSOLE.print("No view is held out; evaluating on the training views.")
+            outputs = self.train_dataparser_outputs
         return self._dataset(outputs, self.train_dataset.metadata["space"])
 
     def _dataset(self, outputs: DataparserOutputs, space: str) -> InputDataset:

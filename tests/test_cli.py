@@ -38,7 +38,7 @@ def test_help_loads_neither_torch_nor_nerfstudio():
     ("arguments", "sentence"),
     [
         (["{tmp}/gone"], "Error: There is no run at {tmp}/gone;"),
-        (["{tmp}/coarse"], "Error: {tmp}/coarse is a run of coarse-fewshot, which stylises nothing;"),
+        (["{tmp}/coarse"], "Error: {tmp}/coarse is a run of coarse-fewshot; name a run of hier-style"),
         ([], "Error: There is no run to show;"),
         (["{tmp}/run", "--video", "{tmp}/1.mp4", "{tmp}/2.mp4"], "Error: There are 2 videos for 1 runs;"),
         (["{tmp}/run", "--video", "{tmp}/gone.mp4"], "Error: The video {tmp}/gone.mp4 can't be read"),

@@ -3,8 +3,11 @@
 import json
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import time
+import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,9 +17,12 @@ import pytest
 import torch
 import yaml
 from conftest import TINY, TINY_STYLE, ns_train, only_run, run_entrypoint
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.trainer import Trainer
+from scipy.spatial.transform import Rotation
 
 from sparsestyle_ns.coarse_run import newest_checkpoint
+from sparsestyle_ns.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.method_configs import method_config
 
 METHODS = ("coarse-fewshot", "coarse-fewshot-draft", "hier-style", "hier-style-draft")
@@ -264,3 +270,87 @@ def test_blender_scenes_train_too(tmp_path: Path, painting: Path) -> None:
     saved = json.loads((only_run(outputs, "hier-style") / "scene.json").read_text())
     assert (saved["space"], saved["background_color"]) == ("box", [1.0, 1.0, 1.0])
     assert saved["view_ids"] == [0, 1, 2, 3, 5, 6, 7, 8]  # eight evenly spaced of nine: too few for the standard eight
+
+
+def write_ring(folder: Path) -> np.ndarray:
+    """Six photos, 16 × 12, taken from all around; returns their poses, looking along −z with y up."""
+    (folder / "images").mkdir(parents=True)
+    poses = []
+    for index, angle in enumerate(np.linspace(0, 2 * np.pi, 6, endpoint=False)):
+        back = np.array([np.cos(angle), np.sin(angle), 0.0])
+        pose = np.eye(4)
+        pose[:3] = np.stack([np.cross([0, 0, 1.0], back), [0, 0, 1.0], back, 2 * back], axis=-1)
+        poses.append(pose)
+        colors = np.random.default_rng(index).integers(0, 256, (12, 16, 3), dtype=np.uint8)
+        iio.imwrite(folder / "images" / f"{index}.png", colors)
+    return np.array(poses)
+
+
+def write_transforms(folder: Path, poses: np.ndarray) -> None:
+    """nerfstudio's transforms.json for the photos of `write_ring`."""
+    frames = [
+        {"file_path": f"images/{index}.png", "transform_matrix": pose.tolist()} for index, pose in enumerate(poses)
+    ]
+    camera = {"fl_x": 16.0, "fl_y": 16.0, "cx": 8.0, "cy": 6.0, "w": 16, "h": 12, "camera_model": "OPENCV"}
+    (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+
+
+def test_nerfstudio_captures_train_on_the_views_asked_for_in_contracted_space(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "capture", write_ring(tmp_path / "capture"))
+    flags = ["--num-views", "4", "--max-num-iterations", "2", *TINY]
+    ns_train("coarse-fewshot", tmp_path / "capture", tmp_path / "outputs", *flags, parser="nerfstudio-data")
+    scene = json.loads((only_run(tmp_path / "outputs", "coarse-fewshot") / "scene.json").read_text())
+    assert scene["space"] == "contracted"
+    assert len(scene["view_names"]) == 4
+
+
+def test_a_capture_too_small_to_hold_views_out_can_still_be_evaluated(tmp_path: Path) -> None:
+    data = FewShotDataManagerConfig(data=tmp_path / "capture", dataparser=NerfstudioDataParserConfig())
+    write_transforms(tmp_path / "capture", write_ring(tmp_path / "capture"))
+    manager = data.setup(device="cpu", test_mode="inference")
+    assert len(manager.eval_dataset) == len(manager.train_dataset) == 6
+
+
+def test_colmap_captures_train_on_the_views_asked_for(tmp_path: Path) -> None:
+    poses = write_ring(tmp_path / "capture")
+    sparse = tmp_path / "capture" / "colmap" / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    (sparse / "cameras.txt").write_text("1 PINHOLE 16 12 16 16 8 6\n")
+    lines = []
+    for index, pose in enumerate(poses):
+        rotation = (pose[:3, :3] * [1, -1, -1]).T  # COLMAP's cameras look along +z with y down
+        x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+        lines += [" ".join(map(str, [index + 1, w, x, y, z, *(-rotation @ pose[:3, 3]), 1, f"{index}.png"])), "1 1 1"]
+    (sparse / "images.txt").write_text("\n".join(lines) + "\n")
+    (sparse / "points3D.txt").write_text("1 0 0 0 255 0 0 0.5 1 0\n")
+    flags = ["--num-views", "3", "--max-num-iterations", "2", *TINY]
+    ns_train("coarse-fewshot", tmp_path / "capture", tmp_path / "outputs", *flags, parser="colmap")
+    scene = json.loads((only_run(tmp_path / "outputs", "coarse-fewshot") / "scene.json").read_text())
+    assert len(scene["view_names"]) == 3
+
+
+def test_the_viewer_opens_a_stylised_run(runs: SimpleNamespace) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    script = "from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"
+    command = [sys.executable, "-c", script, "--load-config", str(runs.style / "config.yml")]
+    command += ["--viewer.websocket-port", str(port), "--viewer.websocket-host", "127.0.0.1"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as viewer:
+        try:
+            page = wait_for_page(f"http://127.0.0.1:{port}", viewer)
+        finally:
+            viewer.kill()
+    assert "<html" in page
+
+
+def wait_for_page(url: str, server: subprocess.Popen) -> str:
+    """What a server answers once it is up."""
+    for _ in range(240):
+        assert server.poll() is None, server.stderr.read()
+        try:
+            with urllib.request.urlopen(url, timeout=5) as answer:
+                return answer.read().decode()
+        except OSError:
+            time.sleep(0.5)
+    raise AssertionError(f"{url} didn't answer in two minutes")

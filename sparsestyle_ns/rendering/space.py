@@ -276,7 +276,9 @@ class ContractedSpace(Space):
 def make_space(scene_box: SceneBox, metadata: Dict[str, Any]) -> Space:
     """The space that a dataset's metadata asks for: its key `space` is "ndc", "box" or "contracted"."""
     if metadata["space"] == "ndc":
-        focal_over_half_size, depth_range = metadata["ndc_focal_over_half_size"], metadata["ndc_depth_range"]
+        focal_over_half_size, depth_range = (
+            tuple(metadata[key]) for key in ("ndc_focal_over_half_size", "ndc_depth_range")
+        )
         return ForwardFacingSpace(scene_box, focal_over_half_size, metadata["ndc_near"], depth_range)
     if metadata["space"] == "box":
         return BoxSpace(scene_box)
