@@ -405,7 +405,7 @@ def _parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:
     parser.add_argument(
         "--scene", choices=("llff", "blender"), default="llff", help="a still life, or objects seen from all around"
     )
-    parser.add_argument("--frames", type=int, default=36, help=f"frames of the film, {FRAMES_PER_SECOND} a second")
+    parser.add_argument("--frames", type=int, default=24, help=f"frames of the film, {FRAMES_PER_SECOND} a second")
     parser.add_argument("--film-side", type=int, default=128, help="longer side of its frames in pixels (default: 128)")
     parser.add_argument("--images", action="store_true", help="also write the film's frames as PNG files")
     parser.add_argument("--iterations-coarse", type=int, help="iterations of stage 1 (default: the draft's own)")

@@ -21,7 +21,7 @@ from sparsestyle_ns.trainer import (
 
 def _coarse_fewshot(draft: bool) -> TrainerConfig:
     """Stage 1; the draft is for images of about 128 pixels and two CPU cores."""
-    iterations = 3000 if draft else 50_000
+    iterations = 2500 if draft else 50_000
     return SparseStyleTrainerConfig(
         _target=CoarseFewShotTrainer,
         method_name="coarse-fewshot-draft" if draft else "coarse-fewshot",
@@ -63,6 +63,7 @@ def _hier_style(draft: bool) -> TrainerConfig:
             datamanager=FewShotDataManagerConfig(max_image_side=128 if draft else 1008),
             model=HierStyleModelConfig(num_steps=64, occupancy_resolution=96) if draft else HierStyleModelConfig(),
             feature_side=252 if draft else 504,
+            warm_start_steps=40 if draft else 60,
         ),
         optimizers={
             "fields": {
@@ -82,7 +83,7 @@ coarse_fewshot = MethodSpecification(
 )
 coarse_fewshot_draft = MethodSpecification(
     config=_coarse_fewshot(draft=True),
-    description="coarse-fewshot for small machines: images of 128 pixels, a minute or three on two CPU cores.",
+    description="coarse-fewshot for small machines: images of 128 pixels, about three minutes on two CPU cores.",
 )
 hier_style = MethodSpecification(
     config=_hier_style(draft=False),
@@ -90,7 +91,7 @@ hier_style = MethodSpecification(
 )
 hier_style_draft = MethodSpecification(
     config=_hier_style(draft=True),
-    description="hier-style for small machines: images of 128 pixels, a few minutes on two CPU cores.",
+    description="hier-style for small machines: images of 128 pixels, about four minutes on two CPU cores.",
 )
 
 
