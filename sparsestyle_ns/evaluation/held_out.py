@@ -75,19 +75,27 @@ def evaluate_held_out(pipeline: VanillaPipeline, targets: Optional[StyleTargets]
             values = {f"coarse_{key}": value for key, value in image_metrics(outputs["rgb_coarse"], photo).items()}
             values["content_ssim"] = image_metrics(outputs["rgb"], photo)["ssim"]
             if targets is not None:
-                values.update(stylisation_losses(targets, outputs["rgb_coarse"], outputs["rgb"]))
+                accumulation = None if model.background is None else outputs["accumulation"].squeeze(-1)
+                losses = stylisation_losses(targets, outputs["rgb_coarse"], outputs["rgb"], accumulation)
+                values.update(losses)
         views.append(values)
     means = {key: sum(view[key] for view in views) / len(views) for key in views[0]}
     return HeldOutReport(means, views)
 
 
 def stylisation_losses(
-    targets: StyleTargets, coarse: Float[Tensor, "H W 3"], stylised: Float[Tensor, "H W 3"]
+    targets: StyleTargets,
+    coarse: Float[Tensor, "H W 3"],
+    stylised: Float[Tensor, "H W 3"],
+    accumulation: Optional[Float[Tensor, "H W"]],
 ) -> Dict[str, float]:
-    """Style loss of a view before and after stylising, and the content loss against the view before."""
+    """Style loss of a view before and after stylising, and the content loss against the view before.
+
+    With `accumulation`, only where the scene covers the picture: a background can't be stylised.
+    """
     content = targets.features(coarse)
-    before, _ = targets.losses(coarse, content)
-    after, moved = targets.losses(stylised, content)
+    before, _ = targets.losses(coarse, content, accumulation)
+    after, moved = targets.losses(stylised, content, accumulation)
     return {"style_loss_before": float(before), "style_loss": float(after), "content_loss": float(moved)}
 
 

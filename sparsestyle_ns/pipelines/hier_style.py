@@ -108,11 +108,13 @@ class ContentView:
         frozen: its rays, ready to render.
         picture: its photo or coarse render, in the painting's colours where the palette is transferred.
         features: the feature network's view of it.
+        accumulation: how opaque the coarse field is in each pixel; None where there is no background behind it.
     """
 
     frozen: FrozenView
     picture: Float[Tensor, "H W 3"]
     features: Float[Tensor, "1 768 h w"]
+    accumulation: Optional[Float[Tensor, "H W"]]
 
 
 class HierStylePipeline(CheckedPipeline):
@@ -166,8 +168,10 @@ class HierStylePipeline(CheckedPipeline):
         if self.config.palette_transfer:
             pictures = self._in_style_colors(pictures, weights)
         self.views = [
-            ContentView(view, picture, self.targets.features(picture))
-            for view, picture in zip(frozen, pictures, strict=True)
+            ContentView(
+                view, picture, self.targets.features(picture), None if self.model.background is None else weight
+            )
+            for view, picture, weight in zip(frozen, pictures, weights, strict=True)
         ]
         self._report_cache()
 
@@ -255,7 +259,7 @@ class HierStylePipeline(CheckedPipeline):
         assert self.targets is not None
         view = self.views[step % len(self.views)]
         image = view.frozen.render(lambda chunk: self.model.stylised(chunk).rgb).view(view.picture.shape)
-        style, content = self.targets.losses(image, view.features)
+        style, content = self.targets.losses(image, view.features, view.accumulation)
         config = self.config
         weight = content_weight(step, config.content_weight, config.content_decay, config.content_steps)
         metrics = {"content": content.detach(), "style": style.detach(), "lambda": weight}
@@ -269,6 +273,7 @@ class HierStylePipeline(CheckedPipeline):
         camera, batch = self.datamanager.next_eval_image(step)
         outputs = self.model.get_outputs_for_camera(camera)
         content = self.targets.features(batch["image"][..., :3].to(self.device))
-        style, content_loss = self.targets.losses(outputs["rgb"], content)
+        accumulation = None if self.model.background is None else outputs["accumulation"].squeeze(-1)
+        style, content_loss = self.targets.losses(outputs["rgb"], content, accumulation)
         self.train()
         return outputs, {"content_loss": content_loss, "style_loss": style}, {}

@@ -1,6 +1,6 @@
 """What a stylised view is compared with: features of the style image and of the content picture of each view."""
 
-from typing import Tuple
+from typing import Optional, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -53,8 +53,24 @@ class StyleTargets:
         return self.backbone(fit_side(image.permute(2, 0, 1)[None], self.feature_side))
 
     def losses(
-        self, image: Float[Tensor, "H W 3"], content: Float[Tensor, "1 768 h w"]
+        self,
+        image: Float[Tensor, "H W 3"],
+        content: Float[Tensor, "1 768 h w"],
+        accumulation: Optional[Float[Tensor, "H W"]] = None,
     ) -> Tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """L_style and L_content of a rendered picture."""
-        features = self.features(image)
-        return nnfm_loss(feature_rows(features), self.style_rows), content_loss(features, content)
+        """L_style and L_content of a rendered picture.
+
+        Args:
+            image: the picture, in [0, 1].
+            content: features of the picture that it must stay like.
+            accumulation: how opaque the scene is in each pixel. Where it is less than half, the picture shows a
+                background that nothing can stylise, and its features don't count. None: all count.
+        """
+        features, target = feature_rows(self.features(image)), feature_rows(content)
+        if accumulation is not None:
+            covered = (
+                F.interpolate(accumulation[None, None].float(), size=content.shape[-2:], mode="area").flatten() > 0.5
+            )
+            if covered.any():
+                features, target = features[covered], target[covered]
+        return nnfm_loss(features, self.style_rows), content_loss(features, target)
