@@ -137,7 +137,7 @@ def unpack_scene(archive: Path, scene: str, marker: str, target: Path) -> None:
                     advance(member.file_size)
     except (zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise FetchError(f"What was downloaded is not a sound zip archive ({error}); check --url.") from error
-    except (NotImplementedError, RuntimeError) as error:
+    except RuntimeError as error:
         raise FetchError(f"The zip archive cannot be unpacked here: {error}; choose another --url.") from error
 
 
