@@ -1,10 +1,10 @@
 """Multi-resolution hash grid ψ(x) (Sec. 3.1; instant-ngp, Sec. 3): what depends on positions, and what learns.
 
-`HashGrid.locate` gives the table rows and interpolation weights of points; `HashGrid.interpolate` gathers and sums.
-Points that stay the same from step to step are located once.
+`HashGrid.locate` prepares points; `HashGrid.interpolate` gathers and sums table rows. Points that stay the same from
+step to step are located once. `locate_corners` and `interpolate` are the readable form in torch, which other devices
+than the CPU run; a CPU has kernels of its own for it.
 """
 
-import warnings
 from typing import NamedTuple, Optional, Tuple
 
 import torch
@@ -13,30 +13,40 @@ from jaxtyping import Float, Int
 from nerfstudio.field_components.encodings import FieldComponent
 from torch import Tensor, nn
 
+from sparsestyle_ns.field_components import hash_grid_kernels
+
 HASH_PRIMES = (1, 2654435761, 805459861)
 """π1, π2, π3 of the spatial hash (instant-ngp, Eq. 4)."""
+
+
+class Corners(NamedTuple):
+    """The corners of the cells that points lie in.
+
+    Attributes:
+        rows: of the joined table, for the eight corners of each point's cell on each level.
+        weights: trilinear weights of those corners; they sum to 1 on each level.
+    """
+
+    rows: Int[Tensor, "points levels 8"]
+    weights: Float[Tensor, "points levels 8"]
 
 
 class GridLocation(NamedTuple):
     """Where points lie in a hash grid.
 
     Attributes:
-        indices: rows of the joined table, the eight corners of each point's cell on each level.
-        weights: trilinear weights of those corners; they sum to 1 on each level.
-        scatter: `scatter_matrix` of these two, or None. With it the backward pass is fast on a CPU.
+        positions: of the points, in [0, 1].
+        corners: of their cells; None on a CPU, which works them out again faster than it reads them back.
     """
 
-    indices: Int[Tensor, "points levels 8"]
-    weights: Float[Tensor, "points levels 8"]
-    scatter: Optional[Tensor] = None
+    positions: Float[Tensor, "points 3"]
+    corners: Optional[Corners]
 
     @property
     def num_bytes(self) -> int:
         """Memory that the location takes."""
-        dense = sum(part.numel() * part.element_size() for part in (self.indices, self.weights))
-        if self.scatter is None:
-            return dense
-        return dense + 4 * len(self.scatter) + 8 * self.weights.numel()
+        parts = (self.positions, *(self.corners or ()))
+        return sum(part.numel() * part.element_size() for part in parts)
 
 
 def grid_resolutions(num_levels: int, min_resolution: int, max_resolution: int) -> Tuple[int, ...]:
@@ -56,72 +66,64 @@ def hash_corners(corners: Int[Tensor, "*batch 3"], table_size: int) -> Int[Tenso
     return (x ^ y ^ z) & (table_size - 1)
 
 
-def locate(positions: Float[Tensor, "points 3"], resolutions: Tuple[int, ...], table_size: int) -> GridLocation:
-    """Table rows and trilinear weights of points in [0, 1]³ on each level; points outside are moved to the border.
+def locate_corners(positions: Float[Tensor, "points 3"], resolutions: Tuple[int, ...], table_size: int) -> Corners:
+    """Table rows and trilinear weights of points in [0, 1]³ on each level.
 
     Level m's rows start at m · T of the joined table.
     """
     scale = torch.tensor(resolutions, device=positions.device, dtype=positions.dtype)
-    scaled = positions.clamp(0.0, 1.0)[:, None] * scale[:, None]
+    scaled = positions[:, None] * scale[:, None]
     lower = scaled.floor()
     fraction = scaled - lower
     offsets = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], device=positions.device)
     corners = lower.long()[:, :, None] + offsets
     near = torch.where(offsets.bool(), fraction[:, :, None], 1.0 - fraction[:, :, None])
     level_start = torch.arange(len(resolutions), device=positions.device)[:, None] * table_size
-    return GridLocation((hash_corners(corners, table_size) + level_start).int(), near.prod(dim=-1))
+    return Corners((hash_corners(corners, table_size) + level_start).int(), near.prod(dim=-1))
 
 
 class _GatherSum(torch.autograd.Function):
-    """Weighted sums of table rows, whose backward pass is a product with a sparse matrix where one is at hand."""
+    """Weighted sums of table rows, without the eight summands of each written down in the forward pass."""
 
     @staticmethod
-    def forward(ctx, table: Tensor, location: GridLocation) -> Tensor:
-        ctx.location, ctx.rows = location, len(table)
-        points, levels, corners = location.indices.shape
-        bags = (points * levels, corners)
-        weights = location.weights.to(table.dtype).reshape(bags)
-        sums = F.embedding_bag(location.indices.reshape(bags), table, per_sample_weights=weights, mode="sum")
+    def forward(ctx, table: Tensor, corners: Corners) -> Tensor:
+        ctx.corners, ctx.rows = corners, len(table)
+        points, levels, count = corners.rows.shape
+        bags = (points * levels, count)
+        weights = corners.weights.to(table.dtype).reshape(bags)
+        sums = F.embedding_bag(corners.rows.reshape(bags), table, per_sample_weights=weights, mode="sum")
         return sums.view(points, levels * table.shape[-1])
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> Tuple[Tensor, None]:
-        indices, weights, scatter = ctx.location
-        features = grad.shape[-1] // indices.shape[1]
-        bags = grad.reshape(-1, features)
-        if scatter is not None:
-            return scatter @ bags, None
-        parts = weights.to(grad.dtype).reshape(-1, 8, 1) * bags[:, None]
-        table_grad = grad.new_zeros(ctx.rows, features).index_add_(0, indices.flatten().long(), parts.flatten(0, 1))
-        return table_grad, None
+        rows, weights = ctx.corners
+        bags = grad.reshape(rows.shape[0] * rows.shape[1], 1, -1)
+        parts = weights.to(grad.dtype).reshape(-1, 8, 1) * bags
+        table_grad = grad.new_zeros(ctx.rows, parts.shape[-1])
+        return table_grad.index_add_(0, rows.flatten().long(), parts.flatten(0, 1)), None
 
 
-def interpolate(table: Float[Tensor, "rows features"], location: GridLocation) -> Float[Tensor, "points encoded"]:
+def interpolate(table: Float[Tensor, "rows features"], corners: Corners) -> Float[Tensor, "points encoded"]:
     """Weighted sums of table rows: for each point and level, the eight corners' features; levels one after another.
 
-    Differentiable in the table; locations are taken as given.
+    Differentiable in the table; corners are taken as given.
     """
-    return _GatherSum.apply(table, location)
+    return _GatherSum.apply(table, corners)
 
 
-def scatter_matrix(location: GridLocation, rows: int) -> Tensor:
-    """The matrix whose product with gradients of sums gives the gradient of the table: [rows, points · levels], CSR.
+class _FusedOnCpu(torch.autograd.Function):
+    """`locate_corners` and `interpolate` in one pass over the points, in either direction."""
 
-    On a CPU it makes the backward pass several times as fast as adding gradients up one by one; building it takes
-    about as long as one backward pass without it, so it pays for locations that are used again and again.
-    """
-    indices = location.indices.flatten()
-    order = torch.argsort(indices, stable=True)
-    starts = F.pad(torch.cumsum(torch.bincount(indices, minlength=rows), dim=0), (1, 0))
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Sparse (CSR tensor support is in beta|invariant checks)")
-        return torch.sparse_csr_tensor(
-            starts.int(),
-            (order // 8).int(),
-            location.weights.flatten()[order],
-            size=(rows, indices.numel() // 8),
-            check_invariants=False,
-        )
+    @staticmethod
+    def forward(ctx, table: Tensor, positions: Tensor, resolutions: Tuple[int, ...]) -> Tensor:
+        ctx.positions, ctx.resolutions, ctx.shape = positions, resolutions, table.shape
+        return hash_grid_kernels.gather(table.view(len(resolutions), -1, table.shape[-1]), positions, resolutions)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> Tuple[Tensor, None, None]:
+        levels = (len(ctx.resolutions), ctx.shape[0] // len(ctx.resolutions), ctx.shape[1])
+        table_grad = hash_grid_kernels.scatter(grad, ctx.positions, ctx.resolutions, levels)
+        return table_grad.view(ctx.shape), None, None
 
 
 class HashGrid(FieldComponent):
@@ -152,18 +154,17 @@ class HashGrid(FieldComponent):
         self.table = nn.Parameter(table.uniform_(-init_scale, init_scale))
 
     def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
-        """`locate` on this grid's levels; positions in [0, 1]³."""
-        return locate(positions, self.resolutions, self.table_size)
-
-    def for_reuse(self, location: GridLocation) -> GridLocation:
-        """The same location, prepared to be interpolated at many times."""
-        if location.indices.device.type != "cpu":
-            return location
-        return location._replace(scatter=scatter_matrix(location, len(self.table)))
+        """Where points are; those outside [0, 1]³ are moved to the border."""
+        positions = positions.to(self.table.dtype).clamp(0.0, 1.0)
+        if positions.device.type == "cpu":
+            return GridLocation(positions, None)
+        return GridLocation(positions, locate_corners(positions, self.resolutions, self.table_size))
 
     def interpolate(self, location: GridLocation) -> Float[Tensor, "points encoded"]:
-        """`interpolate` in this grid's tables."""
-        return interpolate(self.table, location)
+        """ψ at located points; differentiable in the table."""
+        if location.corners is None:
+            return _FusedOnCpu.apply(self.table, location.positions, self.resolutions)
+        return interpolate(self.table, location.corners)
 
     def forward(self, in_tensor: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch encoded"]:
         """ψ(x) at positions in [0, 1]³."""

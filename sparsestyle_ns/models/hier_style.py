@@ -1,6 +1,6 @@
 """`hier-style`: the coarse field, frozen, and the residual field that stylises it (stage 2)."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional, Tuple, Type
 
 import torch
@@ -146,12 +146,7 @@ class HierStyleModel(Model):
         """A view for whole-image steps, in chunks of at most `samples_per_chunk` samples (see `FrozenView`)."""
         counts = torch.cat([self._count_samples(*rays) for rays in _pairs(origins, directions, RAYS_PER_CALL)])
         runs = split_by_samples(counts, samples_per_chunk)
-        return FrozenView(
-            runs, lambda run: self.freeze(origins[run], directions[run]), self._prepare_for_reuse, keep_bytes
-        )
-
-    def _prepare_for_reuse(self, frozen: FrozenSamples) -> FrozenSamples:
-        return replace(frozen, location=self.residual.grid.for_reuse(frozen.location))
+        return FrozenView(runs, lambda run: self.freeze(origins[run], directions[run]), keep_bytes)
 
     def _count_samples(self, origins: Tensor, directions: Tensor) -> Tensor:
         segments = self.space.segments(origins, directions)

@@ -32,7 +32,6 @@ class FrozenView:
     Args:
         runs: the rays of each chunk.
         freeze: gives the frozen samples of a run of rays.
-        prepare: makes frozen samples that are kept ready for being used many times.
         keep_bytes: memory that kept chunks may take; chunks past it are frozen again whenever they are rendered.
     """
 
@@ -40,7 +39,6 @@ class FrozenView:
         self,
         runs: List[slice],
         freeze: Callable[[slice], FrozenSamples],
-        prepare: Callable[[FrozenSamples], FrozenSamples],
         keep_bytes: float,
     ) -> None:
         self.runs = runs
@@ -48,7 +46,7 @@ class FrozenView:
         self.kept: List[Optional[FrozenSamples]] = []
         self.kept_bytes = 0
         for run in runs:
-            frozen = prepare(freeze(run)) if self.kept_bytes < keep_bytes else None
+            frozen = freeze(run) if self.kept_bytes < keep_bytes else None
             if frozen is not None and self.kept_bytes + frozen.num_bytes <= keep_bytes:
                 self.kept_bytes += frozen.num_bytes
                 self.kept.append(frozen)

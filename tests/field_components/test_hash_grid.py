@@ -10,8 +10,7 @@ from sparsestyle_ns.field_components.hash_grid import (
     grid_resolutions,
     hash_corners,
     interpolate,
-    locate,
-    scatter_matrix,
+    locate_corners,
 )
 
 POINTS = 50
@@ -97,21 +96,21 @@ def test_at_the_nodes_of_the_grid_the_value_is_the_tables_row():
 
 
 def test_weights_are_a_partition_of_one_and_rows_stay_on_their_level(points):
-    location = small_grid().locate(points)
-    assert location.indices.shape == location.weights.shape == (POINTS, 2, 8)
-    assert (location.weights >= 0).all()
-    torch.testing.assert_close(location.weights.sum(dim=-1), torch.ones(POINTS, 2))
+    corners = locate_corners(points, (4, 9), 64)
+    assert corners.rows.shape == corners.weights.shape == (POINTS, 2, 8)
+    assert (corners.weights >= 0).all()
+    torch.testing.assert_close(corners.weights.sum(dim=-1), torch.ones(POINTS, 2))
     for level in range(2):
-        rows = location.indices[:, level]
+        rows = corners.rows[:, level]
         assert rows.min() >= 64 * level and rows.max() < 64 * (level + 1)
 
 
 def test_there_is_no_jump_at_the_border_of_cells(points):
-    table = small_grid().table.detach().double()
+    grid = small_grid().double()
     on_border = points.double()
     on_border[:, 0] = torch.randint(1, 4, (POINTS,), generator=torch.Generator().manual_seed(2)) / 4
     step = torch.tensor([1e-9, 0.0, 0.0], dtype=torch.float64)
-    before, after = (interpolate(table, locate(on_border + side * step, (4, 9), 64)) for side in (-1, 1))
+    before, after = (grid(on_border + side * step) for side in (-1, 1))
     # A table value is at most 1 and a level has at most 9 cells, so the slope is at most 18.
     assert (after - before).abs().max() <= 2e-9 * 18 + 1e-12
 
@@ -137,37 +136,62 @@ def test_no_points_have_no_values(shape):
     assert grid.table.grad.count_nonzero() == 0
 
 
-@pytest.mark.parametrize("prepared", [False, True])
-def test_the_gradient_of_the_table_matches_finite_differences(prepared, points):
-    location = locate(points[:6].double(), (2, 3), 8)
-    if prepared:
-        location = location._replace(scatter=scatter_matrix(location, 16))
+def test_the_gradient_of_the_table_matches_finite_differences(points):
+    grid = HashGrid(2, 2, 3, features_per_level=2, log2_table_size=3, init_scale=1.0).double()
+    location = grid.locate(points[:6])
+
+    def values(table):
+        return torch.func.functional_call(grid, {"table": table}, (location.positions,))
+
+    assert location.corners is None
+    assert torch.autograd.gradcheck(values, (grid.table,))
+
+
+def test_the_gradient_of_the_readable_form_matches_finite_differences(points):
+    corners = locate_corners(points[:6].double(), (2, 3), 8)
     table = torch.randn(16, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda rows: interpolate(rows, location), (table,))
+    assert torch.autograd.gradcheck(lambda rows: interpolate(rows, corners), (table,))
 
 
-def test_a_location_prepared_for_reuse_gives_the_same_values_and_gradients(points):
-    grid = small_grid()
-    location = grid.locate(points)
-    prepared = grid.for_reuse(location)
+@pytest.mark.parametrize("features", [1, 2, 4, 5])
+@pytest.mark.parametrize("threads", [1, 3, 20])
+def test_the_cpus_kernels_and_the_readable_form_agree_in_values_and_gradients(features, threads, points):
+    grid = small_grid(features_per_level=features)
     importance = torch.randn(POINTS, grid.get_out_dim(), generator=torch.Generator().manual_seed(4))
-    values, gradients = [], []
-    for each in (location, prepared):
-        values.append(grid.interpolate(each))
-        gradients.append(torch.autograd.grad((importance * values[-1]).sum(), grid.table)[0])
-    assert torch.equal(*values)
+    corners = locate_corners(points, grid.resolutions, grid.table_size)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        values = [grid(points), interpolate(grid.table, corners)]
+        gradients = [torch.autograd.grad((importance * each).sum(), grid.table)[0] for each in values]
+    finally:
+        torch.set_num_threads(before)
+    torch.testing.assert_close(*values, atol=1e-6, rtol=1e-6)
     # A row that many corners share sums some tens of float32 numbers in another order.
     torch.testing.assert_close(*gradients, atol=1e-5, rtol=1e-5)
 
 
-def test_the_memory_of_a_location_counts_all_of_its_parts(points):
+def test_gradients_are_the_same_to_the_bit_whenever_they_are_computed(points):
     grid = small_grid()
-    corners = POINTS * 2 * 8
-    location = grid.locate(points)
-    assert location.num_bytes == corners * (4 + 4)
-    prepared = grid.for_reuse(location)
-    scatter = prepared.scatter
-    parts = (scatter.crow_indices(), scatter.col_indices(), scatter.values())
-    held = location.num_bytes + sum(part.numel() * part.element_size() for part in parts)
-    # The one row start too many is not worth counting.
-    assert prepared.num_bytes == pytest.approx(held, abs=4)
+    gradients = [torch.autograd.grad(grid(points).square().sum(), grid.table)[0] for _ in range(2)]
+    assert torch.equal(*gradients)
+
+
+def test_the_gradient_may_come_in_any_layout(points):
+    grid = small_grid()
+    importance = torch.randn(grid.get_out_dim(), POINTS).T
+    strided, packed = (
+        torch.autograd.grad((grid(points) * each).sum(), grid.table)[0]
+        for each in (importance, importance.contiguous())
+    )
+    assert torch.equal(strided, packed)
+    (broadcast,) = torch.autograd.grad(grid(points).sum(), grid.table)
+    (written_out,) = torch.autograd.grad((grid(points) * torch.ones(POINTS, grid.get_out_dim())).sum(), grid.table)
+    assert torch.equal(broadcast, written_out)
+
+
+def test_the_memory_of_a_location_counts_all_of_its_parts(points):
+    location = small_grid().locate(points)
+    assert location.num_bytes == POINTS * 3 * 4
+    kept = location._replace(corners=locate_corners(points, (4, 9), 64))
+    assert kept.num_bytes == POINTS * 3 * 4 + POINTS * 2 * 8 * (4 + 4)

@@ -120,5 +120,4 @@ def test_by_default_it_is_the_papers_network():
 def test_the_cube_of_field_coordinates_is_the_unit_cube_of_the_grid(frozen):
     field = residual_field()
     location, expected = field.locate(frozen[0]), field.grid.locate((frozen[0] + 1) / 2)
-    assert torch.equal(location.indices, expected.indices)
-    assert torch.equal(location.weights, expected.weights)
+    assert torch.equal(location.positions, expected.positions)

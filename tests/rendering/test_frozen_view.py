@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import pytest
 import torch
 from nerfstudio.data.scene_box import SceneBox
@@ -38,9 +36,6 @@ class Scene:
         segments = SPACE.segments(*(part[run] for part in self.rays))
         return freeze_samples(self.coarse, self.residual, self.occupancy, segments, STEPS, False, 0.0)
 
-    def prepare(self, frozen):
-        return replace(frozen, location=self.residual.grid.for_reuse(frozen.location))
-
     def render_chunk(self, frozen):
         self.rendered_chunks += 1
         return render_stylised(self.residual, frozen, torch.ones(3)).rgb
@@ -48,7 +43,7 @@ class Scene:
     def view(self, max_samples, keep_bytes):
         counts = torch.bincount(self.freeze(slice(0, RAYS)).samples.ray_indices, minlength=RAYS)
         self.frozen_runs.clear()
-        return FrozenView(split_by_samples(counts, max_samples), self.freeze, self.prepare, keep_bytes)
+        return FrozenView(split_by_samples(counts, max_samples), self.freeze, keep_bytes)
 
     def picture_and_gradients(self, view):
         """The picture, and the gradient of its squared error for each parameter of the residual field."""

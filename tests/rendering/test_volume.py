@@ -254,9 +254,9 @@ def test_the_memory_of_frozen_samples_is_that_of_their_tensors(coarse, residual,
     frozen = freeze(coarse, residual, rays)
     samples = 11 * STEPS
     assert frozen.num_rays == RAYS and len(frozen.density) == samples
-    # Ray index (8 bytes), s, length, three coordinates, density and four features (4 bytes each), and for each of
-    # 2 levels and 8 corners an index and a weight of 4 bytes.
-    assert frozen.num_bytes == samples * (8 + 4 * (1 + 1 + 3 + 1 + FEATURES) + 2 * 8 * 8)
+    # Ray index (8 bytes), s, length, three coordinates in the cube and three in the hash grid, density and four features
+    # (4 bytes each).
+    assert frozen.num_bytes == samples * (8 + 4 * (1 + 1 + 3 + 3 + 1 + FEATURES))
 
 
 def test_infinite_intervals_make_every_unbounded_ray_opaque(coarse, residual, rays):

@@ -1,0 +1,45 @@
+"""Inner loops that torch has no operator for, compiled by numba for the CPU.
+
+Numba's own thread pools can't be entered from two threads at once, as a viewer beside training does; so kernels are
+compiled for one thread, and the work is shared out here.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Callable, Sequence, Tuple
+
+import numba
+import torch
+
+
+def kernel(function: Callable[..., None]) -> Callable[..., None]:
+    """Compiles a function of arrays and numbers on its first call; the result is kept on disk for later processes.
+
+    The function gives its results in arrays, must stay inside their bounds (nothing checks), and runs without Python's
+    lock. Products and sums may be contracted to fused ones.
+    """
+    options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # neither the package's folder nor a cache folder can be written to
+        return numba.njit(**options)(function)
+
+
+def run_on_threads(function: Callable[..., None], parts: Sequence[Tuple]) -> None:
+    """Calls `function(*part)` for each part, on as many threads as torch uses.
+
+    Parts must not write to the same places. An error in one is raised here.
+    """
+    threads = min(torch.get_num_threads(), len(parts))
+    if threads <= 1:
+        for part in parts:
+            function(*part)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for result in [pool.submit(function, *part) for part in parts]:
+            result.result()
+
+
+def even_parts(length: int, count: int) -> Sequence[Tuple[int, int]]:
+    """(start, end) of at most `count` runs of nearly the same length that together cover `length`; none is empty."""
+    size = max(1, -(-length // count))
+    return [(start, min(start + size, length)) for start in range(0, length, size)]
