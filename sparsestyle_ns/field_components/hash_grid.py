@@ -1,10 +1,12 @@
 """Multi-resolution hash grid ψ(x) (Sec. 3.1; instant-ngp, Sec. 3): what depends on positions, and what learns.
 
 `HashGrid.locate` prepares points; `HashGrid.interpolate` gathers and sums table rows. Points that stay the same from
-step to step are located once. `locate_corners` and `interpolate` are the readable form in torch, which other devices
-than the CPU run; a CPU has kernels of its own for it.
+step to step are located once. `locate_corners` and `interpolate` are the readable form in torch, which runs anywhere;
+CPU and CUDA have kernels that do the same in one pass.
 """
 
+from importlib.util import find_spec
+from types import ModuleType
 from typing import NamedTuple, Optional, Tuple
 
 import torch
@@ -36,7 +38,7 @@ class GridLocation(NamedTuple):
 
     Attributes:
         positions: of the points, in [0, 1].
-        corners: of their cells; None on a CPU, which works them out again faster than it reads them back.
+        corners: of their cells; None where there are kernels, which work them out faster than they could read them.
     """
 
     positions: Float[Tensor, "points 3"]
@@ -111,19 +113,33 @@ def interpolate(table: Float[Tensor, "rows features"], corners: Corners) -> Floa
     return _GatherSum.apply(table, corners)
 
 
-class _FusedOnCpu(torch.autograd.Function):
+def fused_kernels(device: torch.device) -> Optional[ModuleType]:
+    """The module whose `gather` and `scatter` do the grid's work in one pass on a device; None where there is none.
+
+    Triton comes with torch for CUDA on Linux; where it doesn't, the readable form runs.
+    """
+    if device.type == "cpu":
+        return hash_grid_kernels
+    if device.type == "cuda" and find_spec("triton") is not None:
+        from sparsestyle_ns.field_components import hash_grid_triton
+
+        return hash_grid_triton
+    return None
+
+
+class _Fused(torch.autograd.Function):
     """`locate_corners` and `interpolate` in one pass over the points, in either direction."""
 
     @staticmethod
-    def forward(ctx, table: Tensor, positions: Tensor, resolutions: Tuple[int, ...]) -> Tensor:
-        ctx.positions, ctx.resolutions, ctx.shape = positions, resolutions, table.shape
-        return hash_grid_kernels.gather(table.view(len(resolutions), -1, table.shape[-1]), positions, resolutions)
+    def forward(ctx, table: Tensor, positions: Tensor, resolutions: Tuple[int, ...], kernels: ModuleType) -> Tensor:
+        ctx.positions, ctx.resolutions, ctx.kernels, ctx.shape = positions, resolutions, kernels, table.shape
+        return kernels.gather(table.view(len(resolutions), -1, table.shape[-1]), positions, resolutions)
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> Tuple[Tensor, None, None]:
+    def backward(ctx, grad: Tensor) -> Tuple[Tensor, None, None, None]:
         levels = (len(ctx.resolutions), ctx.shape[0] // len(ctx.resolutions), ctx.shape[1])
-        table_grad = hash_grid_kernels.scatter(grad, ctx.positions, ctx.resolutions, levels)
-        return table_grad.view(ctx.shape), None, None
+        table_grad = ctx.kernels.scatter(grad, ctx.positions, ctx.resolutions, levels)
+        return table_grad.view(ctx.shape), None, None, None
 
 
 class HashGrid(FieldComponent):
@@ -156,15 +172,15 @@ class HashGrid(FieldComponent):
     def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
         """Where points are; those outside [0, 1]³ are moved to the border."""
         positions = positions.to(self.table.dtype).clamp(0.0, 1.0)
-        if positions.device.type == "cpu":
+        if fused_kernels(positions.device) is not None:
             return GridLocation(positions, None)
         return GridLocation(positions, locate_corners(positions, self.resolutions, self.table_size))
 
     def interpolate(self, location: GridLocation) -> Float[Tensor, "points encoded"]:
         """ψ at located points; differentiable in the table."""
-        if location.corners is None:
-            return _FusedOnCpu.apply(self.table, location.positions, self.resolutions)
-        return interpolate(self.table, location.corners)
+        if location.corners is not None:
+            return interpolate(self.table, location.corners)
+        return _Fused.apply(self.table, location.positions, self.resolutions, fused_kernels(self.table.device))
 
     def forward(self, in_tensor: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch encoded"]:
         """ψ(x) at positions in [0, 1]³."""

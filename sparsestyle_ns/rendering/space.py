@@ -79,14 +79,15 @@ class ForwardFacingSegments(LinearSegments):
 
 @dataclass
 class BoxSegments(LinearSegments):
-    """Linear segments in a box, entered at distance `near` and left at `far`."""
+    """Linear segments in a box, entered at distance `near` and left at `far`; `beyond` is behind all of the box."""
 
     near: Float[Tensor, "rays 1"]
     far: Float[Tensor, "rays 1"]
+    beyond: Float[Tensor, "rays 1"]
 
     def distance(self, s: Tensor) -> Tensor:
-        """See `Segments.distance`."""
-        return self.near + s * (self.far - self.near)
+        """See `Segments.distance`; a ray that misses the box sees what is beyond it."""
+        return torch.where(self.hit[:, None], self.near + s * (self.far - self.near), self.beyond)
 
 
 @dataclass
@@ -244,13 +245,15 @@ class BoxSpace(Space):
         """See `Space.segments`."""
         near, far, hit = intersect_box(origins, directions, self.minimum, self.maximum, self.near)
         center = 0.5 * (self.minimum + self.maximum)
-        scale = 2.0 / (self.maximum - self.minimum).amax()
+        size = self.maximum - self.minimum
+        scale = 2.0 / size.amax()
         return BoxSegments(
             start=(origins + near * directions - center) * scale,
             extent=(far - near) * directions * scale,
             hit=hit,
             near=near,
             far=far,
+            beyond=(origins - center).norm(dim=-1, keepdim=True) + 0.5 * size.norm(),
         )
 
 

@@ -116,6 +116,18 @@ def test_distance_grows_along_a_segment_and_ends_at_the_distance_that_stands_for
         torch.testing.assert_close(distances[:, -1], torch.full((RAYS,), MAX_DISTANCE), rtol=2e-3, atol=0)
 
 
+def test_what_a_ray_sees_that_misses_the_box_is_behind_all_of_it():
+    space = BoxSpace(SceneBox(aabb=BOX))
+    origins, directions = random_rays(6.0)
+    segments = space.segments(origins, directions)
+    assert 0 < int(segments.hit.sum()) < RAYS
+    corners = torch.cartesian_prod(*BOX.T)
+    farthest = torch.cdist(origins, corners).amax(dim=-1, keepdim=True)
+    seen = segments.distance(torch.full((RAYS, 1), 0.3))
+    assert (seen >= farthest)[~segments.hit].all()
+    assert (seen <= farthest)[segments.hit].all()
+
+
 def test_packed_positions_are_the_dense_ones(scene):
     space, origins, directions, _ = scene
     segments = space.segments(origins, directions)
