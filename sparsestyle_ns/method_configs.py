@@ -54,21 +54,29 @@ def _hier_style(draft: bool) -> TrainerConfig:
     return HierStyleTrainerConfig(
         _target=HierStyleTrainer,
         method_name="hier-style-draft" if draft else "hier-style",
-        max_num_iterations=120 if draft else 200,
+        max_num_iterations=200,
         steps_per_save=50,
         steps_per_eval_batch=0,
-        steps_per_eval_image=60 if draft else 100,
+        steps_per_eval_image=100,
         steps_per_eval_all_images=0,
         pipeline=HierStylePipelineConfig(
             datamanager=FewShotDataManagerConfig(max_image_side=128 if draft else 1008),
-            model=HierStyleModelConfig(num_steps=64, occupancy_resolution=96) if draft else HierStyleModelConfig(),
+            model=HierStyleModelConfig(
+                num_steps=64,
+                occupancy_resolution=96,
+                # A quarter of the paper's, as the images are: cells finer than the photos' pixels don't reach new views.
+                min_resolution=32,
+                max_resolution=128,
+            )
+            if draft
+            else HierStyleModelConfig(),
             feature_side=252 if draft else 504,
             warm_start_steps=40 if draft else 60,
         ),
         optimizers={
             "fields": {
                 "optimizer": FusedAdamConfig(lr=5e-3),
-                "scheduler": MultiStepSchedulerConfig(gamma=0.33, milestones=(50, 100)),
+                "scheduler": MultiStepSchedulerConfig(gamma=0.33, milestones=(80, 160) if draft else (50, 100)),
             }
         },
         viewer=ViewerConfig(num_rays_per_chunk=1 << 13),
