@@ -12,6 +12,7 @@ from nerfstudio.fields.base_field import Field
 from torch import Tensor, nn
 
 from sparsestyle_ns.field_components.positional_encoding import PositionalEncoding
+from sparsestyle_ns.fields.pieces import in_pieces
 
 DensityActivation = Literal["softplus", "exp"]
 
@@ -76,7 +77,12 @@ class CoarseField(Field):
         self, positions: Float[Tensor, "*batch 3"]
     ) -> Tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch feature"]]:
         """σ_c and e_c at field coordinates in [−1, 1]."""
-        hidden = self.trunk(self.position_encoding(positions))
+        density, feature = in_pieces(self._evaluate, positions.reshape(-1, 3))
+        batch = positions.shape[:-1]
+        return density.view(batch), feature.view(*batch, self.feature_dim)
+
+    def _evaluate(self, points: Float[Tensor, "points 3"]) -> Tuple[Tensor, Tensor]:
+        hidden = self.trunk(self.position_encoding(points))
         raw = self.density_head(hidden).squeeze(-1).float() + self.density_bias
         return activate_density(raw, self.density_activation), self.feature_head(hidden)
 
@@ -84,9 +90,16 @@ class CoarseField(Field):
         self, feature: Float[Tensor, "*batch feature"], directions: Float[Tensor, "*batch 3"]
     ) -> Float[Tensor, "*batch 3"]:
         """c_c in [0, 1], from e_c and unit view directions."""
+        batch = feature.shape[:-1]
+        (color,) = in_pieces(
+            self._evaluate_color, feature.reshape(-1, self.feature_dim), directions.expand(*batch, 3).reshape(-1, 3)
+        )
+        return color.view(*batch, 3)
+
+    def _evaluate_color(self, feature: Tensor, directions: Tensor) -> Tuple[Tensor]:
         if self.direction_encoding is not None:
             feature = torch.cat([feature, self.direction_encoding(directions).to(feature)], dim=-1)
-        return self.color_head(feature)
+        return (self.color_head(feature),)
 
     def get_density(self, ray_samples: RaySamples) -> Tuple[Tensor, Tensor]:
         """nerfstudio's form of `density_and_feature`; the samples' positions are field coordinates."""

@@ -8,6 +8,7 @@ from nerfstudio.field_components.mlp import MLP
 from torch import Tensor, nn
 
 from sparsestyle_ns.field_components.hash_grid import GridLocation, HashGrid
+from sparsestyle_ns.fields.pieces import in_pieces
 
 
 class _NonNegative(torch.autograd.Function):
@@ -85,7 +86,10 @@ class ResidualField(nn.Module):
         coarse_density: Float[Tensor, "points"],
     ) -> Tuple[Float[Tensor, "points"], Float[Tensor, "points 3"]]:
         """σ_f ≥ 0 (Eq. 3) and c_f in [0, 1] at located points, from e_c and σ_c there."""
-        hidden = self.mlp(torch.cat([self.grid.interpolate(location), feature], dim=-1))
+        return in_pieces(self._evaluate, self.grid.interpolate(location), feature, coarse_density)
+
+    def _evaluate(self, encoded: Tensor, feature: Tensor, coarse_density: Tensor) -> Tuple[Tensor, Tensor]:
+        hidden = self.mlp(torch.cat([encoded, feature], dim=-1))
         color = torch.sigmoid(self.color_head(hidden))
         if self.density_head is None:
             return coarse_density, color
