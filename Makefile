@@ -3,10 +3,12 @@
 #   make demo PYTHON=python3.11          another Python for the environment
 #   make test VENV=/path/to/environment  an environment that exists already
 #   make demo DEMO="--scene blender"     options of data_scripts/demo.py
+#   make bench BENCH="--quick --sample"  options of all benchmarks
 
 PYTHON ?= python3
 VENV ?= .venv
 DEMO ?=
+BENCH ?=
 
 BIN := $(abspath $(VENV))/bin
 READY := $(VENV)/.sparsestyle-installed
@@ -14,12 +16,13 @@ READY := $(VENV)/.sparsestyle-installed
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint clean
+.PHONY: help demo test lint bench clean
 
 help:
 	@echo "make demo   sample photos and a painting -> stylised scene, video and page in demo/index.html"
 	@echo "make test   ruff, then the tests"
 	@echo "make lint   ruff alone; 'make lint FIX=1' repairs what it can"
+	@echo "make bench  times it beside nerfstudio and the plain way; hours, table in benchmarks/results/summary.md"
 	@echo "make clean  removes the environment, caches and the demo"
 	@echo
 	@echo "The first of them makes an environment in $(VENV) (a few minutes, about 7 GB on a machine with CUDA wheels)."
@@ -38,6 +41,12 @@ else
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 endif
+
+bench: $(READY)
+	set -e; for name in hash_grid nnfm stage2_step render memory scaling stage1; do \
+	    $(BIN)/python -m benchmarks.$$name $(BENCH); \
+	done
+	$(BIN)/python -m benchmarks.summary $(BENCH)
 
 $(READY): pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install -c constraints.txt -e .[dev]

@@ -53,6 +53,7 @@ def evaluate(
     run: Annotated[Path, tyro.conf.Positional],
     output_path: Path,
     style_image: Optional[Path] = None,
+    baked: bool = False,
 ) -> None:
     """Measures a run on the views it hasn't seen.
 
@@ -63,11 +64,12 @@ def evaluate(
         run: The run's folder or its config.yml.
         output_path: JSON file to write, in the layout of ns-eval.
         style_image: Painting to measure a stylised run against, if not the one it was made with.
+        baked: Also measure how close a stylised run's baked renders are to exact ones (PSNR in dB).
     """
     from sparsestyle_ns.evaluation.held_out import evaluate_run
     from sparsestyle_ns.run_folder import find_config
 
-    report = evaluate_run(find_config(run), output_path, style_image)
+    report = evaluate_run(find_config(run), output_path, style_image, baked)
     for name, value in report.means.items():
         print(f"{name:>20} {value:9.4f}")
     print(f"{len(report.views)} held-out views; the report is {output_path}")

@@ -8,12 +8,15 @@ from typing import Any, Dict, List, Optional
 
 import torch
 from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.models.base_model import Model
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from rich.progress import track
 from torch import Tensor
 
-from sparsestyle_ns.evaluation.image_metrics import image_metrics
+from sparsestyle_ns.evaluation.image_metrics import image_metrics, psnr
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
+from sparsestyle_ns.models.hier_style import RenderMode
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 from sparsestyle_ns.rendering.compositing import dense_weights, effective_samples, optical_depth
 from sparsestyle_ns.rendering.density_grid import interval_lengths
@@ -51,23 +54,27 @@ class HeldOutReport:
 
 
 @torch.no_grad()
-def evaluate_held_out(pipeline: VanillaPipeline, targets: Optional[StyleTargets] = None) -> HeldOutReport:
+def evaluate_held_out(
+    pipeline: VanillaPipeline, targets: Optional[StyleTargets] = None, baked: bool = False
+) -> HeldOutReport:
     """Evaluates a loaded run of either method on all views of its evaluation split.
 
     Coarse run: `psnr` in dB, `ssim`, `lpips` where its weights exist, and `effective_samples`. Stylised run: the same
     of the coarse field with the prefix `coarse_`, `content_ssim`, and with `targets` the style loss of the coarse and
-    the stylised render (`style_loss_before`, `style_loss`), and `content_loss` against the coarse render.
+    the stylised render (`style_loss_before`, `style_loss`), and `content_loss` against the coarse render. All of these
+    are of exact renders.
 
     Args:
         pipeline: in the state in which `eval_setup` leaves it.
         targets: the painting's features, for a stylised run.
+        baked: whether a stylised run's baked renders are held against the exact ones as well (`baked_psnr`, in dB).
     """
     model, views = pipeline.model, []
     dataset = pipeline.datamanager.eval_dataset
     for index in track(range(len(dataset)), description="Held-out views"):
         camera = dataset.cameras[index : index + 1].to(model.device)
         photo = dataset[index]["image"][..., :3]
-        outputs = model.get_outputs_for_camera(camera)
+        outputs = rendered(model, camera, "exact")
         if isinstance(model, CoarseFewShotModel):
             values = image_metrics(outputs["rgb"], photo)
             values["effective_samples"] = mean_effective_samples(model, camera)
@@ -78,9 +85,22 @@ def evaluate_held_out(pipeline: VanillaPipeline, targets: Optional[StyleTargets]
                 accumulation = None if model.background is None else outputs["accumulation"].squeeze(-1)
                 losses = stylisation_losses(targets, outputs["rgb_coarse"], outputs["rgb"], accumulation)
                 values.update(losses)
+            if baked:
+                values["baked_psnr"] = psnr(rendered(model, camera, "baked")["rgb"], outputs["rgb"])
         views.append(values)
     means = {key: sum(view[key] for view in views) / len(views) for key in views[0]}
     return HeldOutReport(means, views)
+
+
+def rendered(model: Model, camera: Cameras, mode: RenderMode) -> Dict[str, Tensor]:
+    """A camera's outputs in a render mode, whatever the model's own is; a coarse run has one."""
+    if isinstance(model, CoarseFewShotModel):
+        return model.get_outputs_for_camera(camera)
+    before, model.render_mode.value = model.render_mode.value, mode
+    try:
+        return model.get_outputs_for_camera(camera)
+    finally:
+        model.render_mode.value = before
 
 
 def stylisation_losses(
@@ -115,7 +135,9 @@ def mean_effective_samples(model: CoarseFewShotModel, camera: Any) -> float:
     return float(torch.cat(counts).mean())
 
 
-def evaluate_run(config_path: Path, output_path: Path, style_image: Optional[Path] = None) -> HeldOutReport:
+def evaluate_run(
+    config_path: Path, output_path: Path, style_image: Optional[Path] = None, baked: bool = False
+) -> HeldOutReport:
     """Loads a run, evaluates it, and writes the report.
 
     Args:
@@ -123,6 +145,7 @@ def evaluate_run(config_path: Path, output_path: Path, style_image: Optional[Pat
         output_path: JSON file to write.
         style_image: painting to measure against; None for the one the run was made with. Where that file is gone, the
             style losses are left out.
+        baked: whether to measure a stylised run's baked renders as well.
 
     Raises:
         InputError: the run has no checkpoint.
@@ -134,6 +157,6 @@ def evaluate_run(config_path: Path, output_path: Path, style_image: Optional[Pat
         settings.style_image = style_image or settings.style_image
         if settings.style_image is not None and settings.style_image.is_file():
             targets = settings.load_targets(pipeline.device)
-    report = evaluate_held_out(pipeline, targets)
+    report = evaluate_held_out(pipeline, targets, baked)
     report.save(output_path, config.experiment_name, config.method_name, step)
     return report

@@ -1,12 +1,13 @@
 """`hier-style`: the coarse field, frozen, and the residual field that stylises it (stage 2)."""
 
 from dataclasses import dataclass, field
-from typing import Any, Dict, List, Optional, Tuple, Type
+from typing import Any, Dict, List, Literal, Optional, Tuple, Type
 
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.viewer.viewer_elements import ViewerDropdown
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -14,10 +15,11 @@ from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
+from sparsestyle_ns.rendering.baked import BakedVolume, Rays, render_baked
 from sparsestyle_ns.rendering.density_grid import Occupancy, march
 from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
 from sparsestyle_ns.rendering.precision import Precision, autocast
-from sparsestyle_ns.rendering.space import make_space
+from sparsestyle_ns.rendering.space import ForwardFacingSpace, Segments, make_space
 from sparsestyle_ns.rendering.volume import (
     POINTS_PER_CALL,
     FrozenSamples,
@@ -29,6 +31,10 @@ from sparsestyle_ns.rendering.volume import (
 
 RAYS_PER_CALL = 1 << 13
 """Rays that are marched at once; bounds the memory of the steps in empty space."""
+RenderMode = Literal["exact", "baked"]
+AHEAD = ((0.0, 0.0, -1.0),)
+"""Where cameras of a forward-facing scene look."""
+ALL_AROUND = ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
 
 
 @dataclass
@@ -68,6 +74,13 @@ class HierStyleModelConfig(ModelConfig):
     """Share of light left, in (0, 1), below which samples farther along the ray are dropped."""
     precision: Precision = "auto"
     """Number format of matrix products: auto is bfloat16 where the device multiplies it, else float32."""
+    render_mode: RenderMode = "exact"
+    """How pictures are made outside of training. baked keeps the fields in a voxel grid, filled where rays come by: a
+    scene's first picture takes as long as an exact one, those from near by a small part of that, also on a CPU. The
+    viewer has a control for it; for ns-render, write `render_mode: baked` into the run's config.yml."""
+    bake_resolution: int = 256
+    """Cells along the cube's side in baked rendering. Each brick of 8³ that rays have been to takes 4 KiB: at most 147 MB
+    with 256, 482 MB with 384."""
     eval_num_rays_per_chunk: int = 8192
     """Rays rendered at once outside of training."""
 
@@ -102,6 +115,10 @@ class HierStyleModel(Model):
         self.occupancy = Occupancy(config.occupancy_resolution)
         color = metadata["background_color"]
         self.register_buffer("background", None if color is None else torch.tensor(color), persistent=False)
+        self.render_mode = ViewerDropdown(
+            "Render mode", config.render_mode, ["exact", "baked"], hint="baked: quick, from a voxel grid"
+        )
+        self._baked: Optional[Tuple[BakedVolume, List[Tensor]]] = None
 
     def get_param_groups(self) -> Dict[str, List[Parameter]]:
         """One group, `fields`: the residual field. The coarse field is frozen."""
@@ -163,12 +180,59 @@ class HierStyleModel(Model):
         with autocast(self.device, self.config.precision):
             return render_frozen_coarse(self.field, frozen, directions, self.background)
 
+    def bake(self, resolution: int) -> BakedVolume:
+        """The fields as they are now, to be kept in a voxel grid; nothing is evaluated before rays are rendered.
+
+        c_c, where it depends on the view direction, is that of a camera that looks straight ahead in a forward-facing
+        scene, and elsewhere the mean over the directions of the axes; c_f and the densities depend on no direction.
+        """
+        seen_from = ALL_AROUND
+        if self.field.direction_encoding is None or isinstance(self.space, ForwardFacingSpace):
+            seen_from = AHEAD
+        directions = torch.tensor(seen_from, device=self.device)
+
+        def shade(points: Tensor) -> Tensor:
+            with autocast(self.device, self.config.precision):
+                density, feature = self.field.density_and_feature(points)
+                feature = feature.float()
+                fine_density, fine_color = self.residual(self.residual.locate(points), feature, density)
+                colors = [self.field.color(feature, direction.expand_as(points)) for direction in directions]
+                color = torch.stack(colors).float().mean(dim=0)
+            return torch.cat([density[:, None], fine_density[:, None], fine_color.float(), color], dim=-1)
+
+        return BakedVolume(shade, resolution, self.device)
+
+    def _current_volume(self) -> BakedVolume:
+        """The baked volume, a new one whenever the model's state has changed since the last picture."""
+        state = self._state_of_weights()
+        if self._baked is None or not all(map(torch.equal, self._baked[1], state)):
+            self._baked = self.bake(self.config.bake_resolution), state
+        return self._baked[0]
+
+    def _state_of_weights(self) -> List[Tensor]:
+        """What changes with every change of the weights and is quick to compare.
+
+        torch counts the changes of each tensor, but not those that fused optimisers make; these change every parameter
+        of the residual MLP.
+        """
+        tensors = [*self.parameters(), *self.buffers()]
+        versions = torch.tensor([(tensor.data_ptr(), tensor._version) for tensor in tensors])
+        values = [parameter for name, parameter in self.residual.named_parameters() if not name.startswith("grid")]
+        return [versions, torch.cat([value.detach().flatten() for value in values])]
+
+    def _render_baked(self, segments: Segments) -> Tuple[PackedRender, PackedRender]:
+        config = self.config
+        rays = Rays(segments, self.occupancy, config.num_steps, self.space.unbounded, config.min_transmittance)
+        return render_baked(self._current_volume(), rays, self.background)
+
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
         """`rgb` (stylised), `rgb_coarse`, `accumulation`, and `depth` of the stylised geometry in world units."""
-        frozen = self.freeze(ray_bundle.origins, ray_bundle.directions)
-        fine = self.stylised(frozen)
-        coarse = self.coarse(frozen, ray_bundle.directions)
         segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
+        if self.render_mode.value == "baked" and not self.training:
+            fine, coarse = self._render_baked(segments)
+        else:
+            frozen = self.freeze(ray_bundle.origins, ray_bundle.directions)
+            fine, coarse = self.stylised(frozen), self.coarse(frozen, ray_bundle.directions)
         return {
             "rgb": fine.rgb,
             "rgb_coarse": coarse.rgb,

@@ -123,7 +123,20 @@ def freeze_samples(
     unbounded: bool,
     min_transmittance: float,
 ) -> FrozenSamples:
-    """Finds the samples of a batch of rays that can show, and evaluates the frozen coarse field there.
+    """Finds the samples of a batch of rays that can show, and evaluates the frozen coarse field there."""
+    samples, density, feature = visible_samples(field, occupancy, segments, num_steps, unbounded, min_transmittance)
+    return FrozenSamples(samples, density, feature, residual.locate(samples.positions), len(segments.hit))
+
+
+def visible_samples(
+    field: CoarseField,
+    occupancy: Occupancy,
+    segments: Segments,
+    num_steps: int,
+    unbounded: bool,
+    min_transmittance: float,
+) -> Tuple[PackedSamples, Float[Tensor, "samples"], Float[Tensor, "samples feature"]]:
+    """The samples of a batch of rays that can show, and σ_c and e_c there.
 
     Samples lie in occupied cells, and in front of them at least `min_transmittance` of the light is left.
     """
@@ -134,8 +147,7 @@ def freeze_samples(
     samples = samples.select(index)
     depth = optical_depth(density, samples.lengths)
     seen = packed_transmittance(depth, samples.ray_indices, num_rays) > min_transmittance
-    samples = samples.select(seen)
-    return FrozenSamples(samples, density[seen], feature[seen], residual.locate(samples.positions), num_rays)
+    return samples.select(seen), density[seen], feature[seen]
 
 
 def evaluate_front_to_back(
@@ -154,10 +166,10 @@ def evaluate_front_to_back(
     found: List[Tuple[Tensor, Tensor, Tensor]] = []
     for first in range(0, max(1, int(counts.max())), SAMPLES_PER_PASS):
         in_pass = (rank >= first) & (rank < first + SAMPLES_PER_PASS) & (depth < opaque_depth)[on_ray]
-        for index in in_pass.nonzero().squeeze(-1).split(POINTS_PER_CALL):
-            density, feature = field.density_and_feature(samples.positions[index])
-            depth.index_add_(0, on_ray[index], optical_depth(density, samples.lengths[index]))
-            found.append((index, density, feature.float()))
+        index = in_pass.nonzero().squeeze(-1)
+        density, feature = field.density_and_feature(samples.positions[index])
+        depth.index_add_(0, on_ray[index], optical_depth(density, samples.lengths[index]))
+        found.append((index, density, feature.float()))
     index, density, feature = (torch.cat(parts) for parts in zip(*found, strict=True))
     order = torch.argsort(index)
     return index[order], density[order], feature[order]
@@ -189,7 +201,12 @@ def render_packed(
     """Composites packed samples of known density and colour; the packed twin of `render_coarse`."""
     weights = packed_weights(optical_depth(density, samples.lengths), samples.ray_indices, num_rays)[:, None]
     values = torch.cat([color, torch.ones_like(weights), samples.s[:, None]], dim=-1)
-    rgb, accumulation, moment = packed_sum(weights * values, samples.ray_indices, num_rays).split([3, 1, 1], dim=-1)
+    return composite(packed_sum(weights * values, samples.ray_indices, num_rays), background)
+
+
+def composite(sums: Float[Tensor, "rays 5"], background: Optional[Float[Tensor, "3"]]) -> PackedRender:
+    """Pixels from a ray's sums of w times colour, of w, and of w times s."""
+    rgb, accumulation, moment = sums.split([3, 1, 1], dim=-1)
     s = torch.where(accumulation > 1e-10, moment / accumulation.clamp(min=1e-10), 1.0)
     return PackedRender(over_background(rgb, accumulation, background), accumulation, s)
 

@@ -1,0 +1,231 @@
+"""Rays through a baked volume on a CPU: from camera to pixel in one pass, nothing written down in between."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sparsestyle_ns.kernels import kernel
+from sparsestyle_ns.rendering.compositing import MAX_OPTICAL_DEPTH
+from sparsestyle_ns.rendering.space import MAX_DISTANCE
+
+LOOKAHEAD = 6
+"""Samples of a ray that may turn out to be missing before the ray waits for them."""
+NO_CELL = -1
+"""Stands for no missing sample in the list of a ray."""
+
+_ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+_SHADE = np.float32(1.0 / 255.0)
+_DEPTH_CAP = np.float32(MAX_OPTICAL_DEPTH)
+_LEAST_DISPARITY = np.float32(0.5 / MAX_DISTANCE)
+_BYTE, _NO_BYTE = np.uint64(255), np.uint64(0)
+_BITS_8, _BITS_16, _BITS_24, _BITS_32, _BITS_40, _BITS_48, _BITS_56 = (np.uint64(8 * byte) for byte in range(1, 8))
+
+
+class Lines(NamedTuple):
+    """Rays, in the two forms that segments have.
+
+    Attributes:
+        values: start and extent of a straight segment in field coordinates, or origin and direction of a ray that the
+            contraction bends; six numbers a ray.
+        hit: whether a ray meets the scene.
+        bent: which of the two forms it is.
+        unbounded: whether the last interval is infinite.
+        spaced: for bent rays, g of the distance at s = 0, and how much further g is at s = 1.
+        edges: borders of the samples in s, the same for every ray.
+    """
+
+    values: np.ndarray
+    hit: np.ndarray
+    bent: bool
+    unbounded: bool
+    spaced: np.ndarray
+    edges: np.ndarray
+
+
+class Voxels(NamedTuple):
+    """What rays go through: see `Occupancy` and `BakedVolume`.
+
+    Attributes:
+        occupied: cells of the cube that hold anything.
+        slots: where each brick's values lie, by brick.
+        words: the eight codes of a voxel, the first in the lowest byte, by slot and place in the brick.
+        resolution: cells between voxels along a side of the cube.
+        unit: the density at which codes go from linear to logarithmic.
+        step: difference of log(1 + density/unit) between neighbouring codes.
+        rounding: part of a step that codes may be off.
+    """
+
+    occupied: np.ndarray
+    slots: np.ndarray
+    words: np.ndarray
+    resolution: int
+    unit: np.float32
+    step: np.float32
+    rounding: np.float32
+
+
+@kernel
+def _point(lines, ray, s):
+    """Field coordinates at s."""
+    line = lines.values[ray]
+    if not lines.bent:
+        return line[0] + s * line[3], line[1] + s * line[4], line[2] + s * line[5]
+    spaced = lines.spaced[0] + s * lines.spaced[1]
+    distance = spaced + spaced if spaced < _HALF else _HALF / max(_ONE - spaced, _LEAST_DISPARITY)
+    x, y, z = line[0] + distance * line[3], line[1] + distance * line[4], line[2] + distance * line[5]
+    norm = max(abs(x), abs(y), abs(z))
+    scale = _HALF if norm < _ONE else (_ONE - _HALF / norm) / norm
+    return x * scale, y * scale, z * scale
+
+
+@kernel
+def _length(lines, ray, sample):
+    """δ of a sample, in field coordinates."""
+    x0, y0, z0 = _point(lines, ray, lines.edges[sample])
+    x1, y1, z1 = _point(lines, ray, lines.edges[sample + 1])
+    x, y, z = x1 - x0, y1 - y0, z1 - z0
+    return np.sqrt(x * x + y * y + z * z)
+
+
+@kernel
+def _scaled(coordinate, size):
+    """Where a coordinate lies on an axis of `size` units; outside of the cube (and for NaN) at its border."""
+    share = _HALF * coordinate + _HALF
+    return np.float32(size) * (min(share, _ONE) if share > _ZERO else _ZERO)
+
+
+@kernel
+def _is_occupied(occupied, x, y, z):
+    size = occupied.shape[0]
+    i, j, k = int(_scaled(x, size)), int(_scaled(y, size)), int(_scaled(z, size))
+    return occupied[min(i, size - 1), min(j, size - 1), min(k, size - 1)]
+
+
+@kernel
+def _words(voxels, i, j, k):
+    """The eight corners of a cell, from (0, 0, 0), (0, 0, 1) … to (1, 1, 1)."""
+    slots, words = voxels.slots, voxels.words
+    x0, y0, z0 = (i & 6) << 6 | (i & 1) << 2, (j & 6) << 4 | (j & 1) << 1, (k & 6) << 2 | (k & 1)
+    i1, j1, k1 = i + 1, j + 1, k + 1
+    x1, y1, z1 = (i1 & 6) << 6 | (i1 & 1) << 2, (j1 & 6) << 4 | (j1 & 1) << 1, (k1 & 6) << 2 | (k1 & 1)
+    i, j, k, i1, j1, k1 = i >> 3, j >> 3, k >> 3, i1 >> 3, j1 >> 3, k1 >> 3
+    slot = slots[i, j, k]
+    if i == i1 and j == j1 and k == k1:  # two cells in three
+        return (
+            words[slot, x0 | y0 | z0],
+            words[slot, x0 | y0 | z1],
+            words[slot, x0 | y1 | z0],
+            words[slot, x0 | y1 | z1],
+            words[slot, x1 | y0 | z0],
+            words[slot, x1 | y0 | z1],
+            words[slot, x1 | y1 | z0],
+            words[slot, x1 | y1 | z1],
+        )
+    return (
+        words[slot, x0 | y0 | z0],
+        words[slots[i, j, k1], x0 | y0 | z1],
+        words[slots[i, j1, k], x0 | y1 | z0],
+        words[slots[i, j1, k1], x0 | y1 | z1],
+        words[slots[i1, j, k], x1 | y0 | z0],
+        words[slots[i1, j, k1], x1 | y0 | z1],
+        words[slots[i1, j1, k], x1 | y1 | z0],
+        words[slots[i1, j1, k1], x1 | y1 | z1],
+    )
+
+
+@kernel
+def _interpolate(words, fx, fy, fz):
+    """Whether all corners are known, and the trilinear mean of each of their eight bytes."""
+    gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
+    weights = (
+        gx * gy * gz,
+        gx * gy * fz,
+        gx * fy * gz,
+        gx * fy * fz,
+        fx * gy * gz,
+        fx * gy * fz,
+        fx * fy * gz,
+        fx * fy * fz,
+    )
+    known = True
+    a, b, c, d, e, f, g, h = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+    for corner in range(8):
+        weight, word = weights[corner], words[corner]
+        known &= (word & _BYTE) != _NO_BYTE
+        a += weight * np.float32(word & _BYTE)
+        b += weight * np.float32(word >> _BITS_8 & _BYTE)
+        c += weight * np.float32(word >> _BITS_16 & _BYTE)
+        d += weight * np.float32(word >> _BITS_24 & _BYTE)
+        e += weight * np.float32(word >> _BITS_32 & _BYTE)
+        f += weight * np.float32(word >> _BITS_40 & _BYTE)
+        g += weight * np.float32(word >> _BITS_48 & _BYTE)
+        h += weight * np.float32(word >> _BITS_56)
+    return known, (a, b, c, d, e, f, g, h)
+
+
+@kernel
+def _transmitted(voxels, code, length, infinite):
+    """exp(−τ) of a sample whose density has this code."""
+    if code - _ONE <= voxels.rounding:
+        return _ONE
+    density = voxels.unit * (np.exp(voxels.step * (code - _ONE)) - _ONE)
+    return np.exp(-_DEPTH_CAP if infinite else -min(density * length, _DEPTH_CAP))
+
+
+@kernel
+def march_rays(rays, start, end, lines, voxels, min_transmittance, sums, missing):
+    """Adds up the samples of `rays[start:end]`, as `render_packed` does.
+
+    Args:
+        rays: indices of rays.
+        sums: result, by ray: rgb, Σw and Σws of the stylised field, and the same of the coarse one.
+        missing: result, by place in `rays`: the cells of samples whose corners aren't known yet, by their lower
+            corner's index among all voxels. A ray that has any has to be marched again.
+    """
+    last, top = len(lines.edges) - 2, voxels.resolution
+    for place in range(start, end):
+        ray = rays[place]
+        if not lines.hit[ray]:
+            continue
+        lacking = 0
+        r, g, b, opacity, moment = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+        coarse_r, coarse_g, coarse_b, coarse_opacity, coarse_moment = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+        light, coarse_light = _ONE, _ONE
+        length = _length(lines, ray, 0)
+        for sample in range(last + 1):
+            if coarse_light <= min_transmittance or lacking == LOOKAHEAD:
+                break
+            s = _HALF * (lines.edges[sample] + lines.edges[sample + 1])
+            x, y, z = _point(lines, ray, s)
+            infinite = lines.unbounded and sample == last
+            if not infinite and not _is_occupied(voxels.occupied, x, y, z):
+                continue
+            u, v, w = _scaled(x, top), _scaled(y, top), _scaled(z, top)
+            i, j, k = min(int(u), top - 1), min(int(v), top - 1), min(int(w), top - 1)
+            known, code = _interpolate(_words(voxels, i, j, k), u - np.float32(i), v - np.float32(j), w - np.float32(k))
+            if not known:
+                missing[place, lacking] = (i * top + j) * top + k
+                lacking += 1
+                continue
+            if lines.bent:
+                length = _length(lines, ray, sample)
+            left = _transmitted(voxels, code[0], length, infinite)
+            weight = coarse_light * (_ONE - left)
+            coarse_light *= left
+            coarse_r += weight * code[5]
+            coarse_g += weight * code[6]
+            coarse_b += weight * code[7]
+            coarse_opacity += weight
+            coarse_moment += weight * s
+            left = _transmitted(voxels, code[1], length, infinite)
+            weight = light * (_ONE - left)
+            light *= left
+            r += weight * code[2]
+            g += weight * code[3]
+            b += weight * code[4]
+            opacity += weight
+            moment += weight * s
+        sums[ray, 0], sums[ray, 1], sums[ray, 2] = _SHADE * r, _SHADE * g, _SHADE * b
+        sums[ray, 3], sums[ray, 4] = opacity, moment
+        sums[ray, 5], sums[ray, 6], sums[ray, 7] = _SHADE * coarse_r, _SHADE * coarse_g, _SHADE * coarse_b
+        sums[ray, 8], sums[ray, 9] = coarse_opacity, coarse_moment

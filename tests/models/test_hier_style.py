@@ -1,0 +1,151 @@
+import copy
+
+import pytest
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import SceneBox
+from torch.nn.functional import normalize
+
+from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
+from sparsestyle_ns.models.hier_style import HierStyleModelConfig
+from sparsestyle_ns.trainer import FusedAdamConfig
+
+BOX = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+
+
+def make_model(direction_levels=None, **settings):
+    torch.manual_seed(0)
+    config = HierStyleModelConfig(
+        coarse_field=CoarseFieldConfig(
+            num_levels=3,
+            num_layers=2,
+            layer_width=16,
+            feature_dim=4,
+            direction_levels=direction_levels,
+        ),
+        hash_levels=2,
+        min_resolution=4,
+        max_resolution=8,
+        log2_table_size=8,
+        layer_width=16,
+        num_steps=24,
+        occupancy_resolution=4,
+        precision="float32",
+        bake_resolution=48,
+        **settings,
+    )
+    metadata = {"space": "box", "background_color": [1.0, 0.5, 0.0]}
+    model = config.setup(scene_box=BOX, num_train_data=1, metadata=metadata).eval()
+    with torch.no_grad():
+        model.residual.grid.table.uniform_(-1, 1)
+        torch.nn.init.normal_(model.residual.density_head.weight, std=0.1)
+        torch.nn.init.normal_(model.residual.color_head.weight)
+    return model
+
+
+@pytest.fixture
+def model():
+    return make_model(render_mode="baked")
+
+
+@torch.no_grad()
+def render(model, mode=None):
+    if mode is not None:
+        model.render_mode.value = mode
+    generator = torch.Generator().manual_seed(0)
+    origins = 3 * normalize(torch.randn(50, 3, generator=generator), dim=-1)
+    aim = torch.rand(50, 3, generator=generator) - 0.5
+    return model.get_outputs(RayBundle(origins, normalize(aim - origins, dim=-1), torch.ones(50, 1)))
+
+
+def assert_close(found, expected, tolerance=0.02):
+    assert found.keys() == expected.keys() == {"rgb", "rgb_coarse", "accumulation", "depth"}
+    for key, value in expected.items():
+        assert found[key].shape == value.shape
+        torch.testing.assert_close(found[key], value, atol=tolerance, rtol=0, msg=key)
+
+
+def volume(model):
+    return model._baked[0]
+
+
+def test_a_baked_picture_is_nearly_the_exact_one_and_exact_is_the_default(model):
+    expected = render(make_model())
+    assert expected["rgb"].std() > 0.05
+    assert_close(render(model), expected)
+
+
+def test_exact_pictures_bake_nothing(model):
+    render(model, "exact")
+    assert model._baked is None
+
+
+def test_a_baked_model_has_the_state_of_an_exact_one(model):
+    names = make_model().state_dict().keys()
+    render(model)
+    assert model.state_dict().keys() == names
+    assert not any("bake" in name for name, _ in [*model.named_modules(), *model.named_buffers()])
+
+
+def test_the_volume_stays_while_the_weights_do(model):
+    render(model)
+    first = volume(model)
+    model.train().eval()
+    render(model)
+    assert volume(model) is first
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_a_training_step_is_seen_in_the_next_picture(model, fused):
+    before = render(model)
+    model.train()
+    parameters = model.get_param_groups()["fields"]
+    optimizer = FusedAdamConfig(lr=0.1, fused=fused).setup(parameters)
+    frozen = model.freeze(torch.tensor([[-3.0, 0.1, 0.2]]), torch.tensor([[1.0, 0.0, 0.0]]))
+    model.stylised(frozen).rgb.sum().backward()
+    optimizer.step()
+    model.eval()
+    after = render(model)
+    assert (after["rgb"] - before["rgb"]).abs().max() > 0.05
+    assert_close(after, render(model, "exact"))
+
+
+@pytest.mark.parametrize("assign", [False, True])
+def test_a_loaded_checkpoint_is_seen_in_the_next_picture(model, assign):
+    state = copy.deepcopy(model.state_dict())
+    state["residual.grid.table"] *= -1  # nothing but the table differs
+    before = render(model)
+    model.load_state_dict(state, assign=assign)
+    after = render(model)
+    assert (after["rgb"] - before["rgb"]).abs().max() > 0.05
+    assert_close(after, render(model, "exact"))
+
+
+def test_another_coarse_field_is_seen_in_the_next_picture(model):
+    render(model)
+    first = volume(model)
+    other = make_model()
+    torch.nn.init.constant_(other.field.density_head.bias, 2.0)
+    model.adopt_coarse(other.state_dict())
+    found = render(model)
+    assert volume(model) is not first
+    assert_close(found, render(model, "exact"))
+
+
+def test_pictures_are_exact_while_the_model_trains(model):
+    found = render(model.train())
+    assert model._baked is None
+    assert_close(found, render(make_model()), tolerance=0)
+
+
+def test_a_coarse_colour_that_depends_on_the_direction_is_baked_as_its_mean_and_the_rest_as_it_is():
+    model = make_model(direction_levels=2)
+    expected, found = render(model, "exact"), render(model, "baked")
+    colors = (expected.pop("rgb_coarse"), found.pop("rgb_coarse"))
+    for key, value in expected.items():
+        torch.testing.assert_close(found[key], value, atol=0.02, rtol=0, msg=key)
+    assert 0 < (colors[0] - colors[1]).abs().mean() < 0.1
+
+
+def test_the_viewers_control_begins_with_the_configs_mode_and_offers_both(model):
+    assert (model.render_mode.value, model.render_mode.options) == ("baked", ["exact", "baked"])

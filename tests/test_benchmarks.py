@@ -1,0 +1,339 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))  # benchmarks isn't installed
+
+from nerfstudio.data.scene_box import SceneBox
+
+from benchmarks import _measure, _scene, nnfm, stage1, summary
+from benchmarks._measure import Duration, Options, Ratio, Report
+from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.field_components.hash_grid import HashGrid
+from sparsestyle_ns.fields.coarse import CoarseField
+from sparsestyle_ns.fields.residual import ResidualField
+from sparsestyle_ns.losses.nnfm import nnfm_loss
+from sparsestyle_ns.rendering.density_grid import Occupancy
+from sparsestyle_ns.rendering.space import BoxSpace, ContractedSpace
+from sparsestyle_ns.rendering.volume import freeze_samples, render_stylised
+
+CPU = torch.device("cpu")
+AMPLE = Ratio(12.5, (10.0, 15.0))
+
+
+class FakeClock:
+    """A clock that goes on only when work is done."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        return self.now
+
+    def work(self, seconds):
+        self.now += seconds
+
+
+def durations(*seconds, stopped=False):
+    return [Duration(one, stopped) for one in seconds]
+
+
+@pytest.fixture
+def options(tmp_path):
+    return Options(device="cpu", threads=torch.get_num_threads(), output_dir=tmp_path)
+
+
+@pytest.fixture(autouse=True)
+def idle_machine(monkeypatch):
+    """Spares each test the second of looking at the machine."""
+    monkeypatch.setattr(_measure.psutil, "cpu_percent", lambda interval: 4.0)
+
+
+# ------------------------------------------------------------------------------------------------------------- timing
+
+
+def test_contenders_take_turns_and_the_warm_up_does_not_count():
+    calls = []
+
+    def contender(name):
+        def measure(repetition):
+            calls.append((name, repetition))
+            return Duration(float(repetition))
+
+        return measure
+
+    found = _measure.alternate({"a": contender("a"), "b": contender("b")}, repeats=2)
+    assert calls == [("a", -1), ("b", -1), ("a", 0), ("b", 0), ("a", 1), ("b", 1)]
+    assert found == {"a": durations(0, 1), "b": durations(0, 1)}
+
+
+def test_only_the_work_is_on_the_clock():
+    clock = FakeClock()
+
+    def prepare(repetition):
+        clock.work(100)
+        return (3.0 + repetition,)
+
+    measure = _measure.timed(clock.work, CPU, prepare, clock)
+    assert [measure(repetition).seconds for repetition in (0, 1)] == [3, 4]
+
+
+def test_ratios_are_taken_pair_by_pair_and_the_median_is_quoted():
+    # Both slow down together in the second pair; the ratio of the sums would be 30 / 16.
+    ratio = _measure.ratio_of_pairs(durations(8, 20, 2), durations(2, 10, 4))
+    assert ratio == Ratio(2.0, (0.5, 4.0))
+
+
+def test_a_stopped_peer_gives_a_lower_bound():
+    peer = [Duration(20), Duration(30, stopped=True)]
+    assert _measure.ratio_of_pairs(peer, durations(2, 2)) == Ratio(12.5, (10, 15), at_least=True)
+
+
+def test_nothing_is_compared_with_what_never_finished():
+    with pytest.raises(ValueError, match="never finished"):
+        _measure.ratio_of_pairs(durations(1), durations(1, stopped=True))
+
+
+def training(psnr_by_step, seconds=2.0):
+    """Steps and checks of a field that has these PSNRs after its iterations."""
+    done = iter(psnr_by_step)
+    state = SimpleNamespace(psnr=0.0)
+
+    def step():
+        state.psnr = next(done)
+        return seconds
+
+    return step, lambda: state.psnr
+
+
+def test_time_to_a_psnr_lies_between_the_checks_around_it():
+    step, evaluate = training([10, 12, 15, 18, 20, 22])
+    duration, history = stage1.time_to_reach(step, evaluate, target=19.0, check_every=2)
+    assert history == [(4, 12), (8, 18), (12, 22)]
+    assert duration == Duration(9.0)
+
+
+def test_a_field_that_is_there_at_the_first_check_has_the_time_of_that():
+    assert stage1.time_to_reach(*training([5, 20]), target=19.0, check_every=2)[0] == Duration(4.0)
+
+
+def test_training_that_takes_too_long_is_stopped_after_a_last_check():
+    duration, history = stage1.time_to_reach(*training([10, 11, 12, 13]), target=19.0, check_every=50, max_seconds=5.0)
+    assert duration == Duration(6.0, stopped=True)
+    assert history == [(6.0, 12)]
+
+
+def test_training_that_gets_there_as_its_time_runs_out_is_not_a_lower_bound():
+    duration, _ = stage1.time_to_reach(*training([10, 19.5]), target=19.0, check_every=50, max_seconds=4.0)
+    assert duration == Duration(4.0)
+
+
+def test_training_ends_with_its_iterations():
+    duration, _ = stage1.time_to_reach(*training([1, 2, 3, 4]), target=19.0, check_every=50, max_steps=3)
+    assert duration == Duration(6.0, stopped=True)
+
+
+# -------------------------------------------------------------------------------------------------------------- files
+
+
+def write_report(options, ratio=AMPLE, target=10.0, name="hash_grid", **more):
+    report = Report(name, options)
+    report.measure("part", {"ours": lambda repetition: Duration(2.0)}, repeats=2)
+    report.add_row(name, "a thing", "another", ratio, target, **more)
+    return json.loads(report.write().read_text())
+
+
+def test_a_report_says_what_was_measured_where_and_when(options):
+    content = write_report(options)
+    assert {"python", "torch", "numpy", "nerfstudio"} <= content["versions"].keys()
+    assert content["device"] and content["threads"] == options.num_threads
+    assert content["date"].endswith("+00:00")
+    assert {"commit", "dirty", "note"} <= content.keys()
+    assert content["repetitions"] == {"part": {"ours": {"seconds": [2.0, 2.0]}}}
+    (row,) = content["rows"]
+    assert row == {
+        "name": "hash_grid",
+        "what": "a thing",
+        "against": "another",
+        "device": content["device"],
+        "ratio": 12.5,
+        "spread": [10.0, 15.0],
+        "target": 10.0,
+    }
+
+
+def test_a_stopped_repetition_is_recorded_as_such(options):
+    report = Report("stage1", options)
+    report.measure("part", {"peer": lambda repetition: Duration(9.0, stopped=True)}, repeats=1)
+    assert report.content()["repetitions"]["part"]["peer"] == {"seconds": [9.0], "stopped": [True]}
+
+
+def test_load_by_other_processes_marks_a_report(options, monkeypatch):
+    monkeypatch.setattr(_measure.psutil, "cpu_percent", lambda interval: 55.0)
+    load = write_report(options)["load_of_others"]
+    assert load["before"] == 0.55 and load["busy"]
+
+
+def test_own_work_is_not_load_by_others():
+    def now(elapsed, idle, own):
+        return SimpleNamespace(monotonic=lambda: elapsed), SimpleNamespace(idle=idle), (own, 0, 0, 0, elapsed)
+
+    with pytest.MonkeyPatch.context() as patch:
+
+        def set_now(*state):
+            clock, times, own = now(*state)
+            patch.setattr(_measure, "time", clock)
+            patch.setattr(_measure.psutil, "cpu_times", lambda: times)
+            patch.setattr(_measure.os, "times", lambda: own)
+
+        patch.setattr(_measure.os, "cpu_count", lambda: 2)
+        set_now(0.0, 0.0, 0.0)
+        load = _measure.OtherLoad()
+        # Ten seconds of two cores: 12 s are ours, 5 s are idle, and 3 s are another process'.
+        set_now(10.0, 5.0, 12.0)
+        assert load.record() == {"before": 0.04, "during": 0.15, "busy": True}
+        set_now(10.0, 7.5, 12.0)
+        assert load.record() == {"before": 0.04, "during": 0.025, "busy": False}
+
+
+def test_summary_collects_rows_and_marks_what_misses_its_target(options, tmp_path, capsys):
+    write_report(options)
+    write_report(options, Ratio(1.5, (1.4, 1.6)), 2.0, "nnfm", bytes=2_500_000_000, against_bytes=3_000_000_000)
+    write_report(options, Ratio(21.0, (21.0, 21.0), at_least=True), 20.0, "stage1")
+    summary.main(options)
+    rows = json.loads((tmp_path / "summary.json").read_text())
+    assert [(row["name"], row["met"]) for row in rows] == [("stage1", True), ("hash_grid", True), ("nnfm", False)]
+    assert [row.get("at_least", False) for row in rows] == [True, False, False]
+    assert all(row["commit"] == rows[0]["commit"] for row in rows)
+    table = (tmp_path / "summary.md").read_text().splitlines()
+    assert len(table) == 2 + len(rows)
+    assert "| ≥ 21 (21 – 21) | 20 | yes |" in table[2]
+    assert "| 1.5 (1.4 – 1.6) | 2 | **no** |" in table[4]
+    assert "peak 2.50 against 3.00 GB" in table[4]
+    assert "2 of 3 meet their targets; not: nnfm" in capsys.readouterr().out
+
+
+def test_a_lower_bound_below_the_target_is_not_called_a_miss(options, tmp_path):
+    write_report(options, Ratio(5.0, (5.0, 5.0), at_least=True), 20.0, "stage1")
+    (row,) = summary.collect(tmp_path)
+    assert not row["met"]
+    assert "not known" in summary.table([row])
+
+
+def test_summary_of_nothing_says_so(options):
+    with pytest.raises(SystemExit, match="There are no results in"):
+        summary.main(options)
+
+
+def test_quick_results_never_replace_real_ones():
+    assert Options().results == _measure.ROOT / "benchmarks" / "results"
+    folders = {Options(quick=quick, sample=sample).results for quick in (False, True) for sample in (False, True)}
+    assert len(folders) == 4
+
+
+# -------------------------------------------------------------------------------------------------------------- scene
+
+
+def test_missing_data_ends_with_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setenv("SPARSESTYLE_DATA", str(tmp_path / "nowhere"))
+    with pytest.raises(InputError, match=r"There is no .*nowhere/llff/fern: .* --sample"):
+        _scene.find_scene(Options())
+
+
+def test_impossible_options_end_with_one_sentence(options):
+    options.repeats = 0
+    with pytest.raises(InputError, match="--repeats is 0, but has to be at least 1"):
+        options.set_up()
+
+
+def test_photos_are_brought_to_a_size_also_a_larger_one(llff_scene, painting):
+    scene = _scene.Scene("tiny", llff_scene, painting)
+    for side in (16, 64):
+        photos = _scene.load_photos(scene, side).train_dataset
+        assert photos[0]["image"].shape == (side * 3 // 4, side, 3)
+        assert photos.cameras.width[0].item() == side
+
+
+@pytest.mark.parametrize("background", [None, (1.0, 0.5, 0.0)])
+@pytest.mark.parametrize(
+    "space", [BoxSpace(SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))), ContractedSpace()], ids=["box", "open"]
+)
+def test_the_plain_way_gives_the_picture_and_the_gradients_that_ours_gives(space, background, monkeypatch):
+    torch.manual_seed(0)
+    coarse = CoarseField(3, 2, 16, feature_dim=4, direction_levels=None, density_activation="exp").requires_grad_(False)
+    grid = HashGrid(num_levels=2, min_resolution=4, max_resolution=8, log2_table_size=10, init_scale=1.0)
+    residual = ResidualField(grid, feature_dim=4, layer_width=16)
+    torch.nn.init.normal_(residual.density_head.weight)
+    color = None if background is None else torch.tensor(background)
+    origins = 3 * torch.nn.functional.normalize(torch.randn(20, 3), dim=-1)
+    directions = torch.nn.functional.normalize(torch.rand(20, 3) - 0.5 - origins, dim=-1)
+
+    frozen = freeze_samples(
+        coarse,
+        residual,
+        Occupancy(4),
+        space.segments(origins, directions),
+        _scene.PLAIN_SAMPLES,
+        space.unbounded,
+        min_transmittance=0.0,
+    )
+    ours = render_stylised(residual, frozen, color).rgb
+    monkeypatch.setattr(_scene, "PLAIN_RAYS_PER_CHUNK", 7)
+    plain_field = _scene.PlainField(coarse, residual, space, color)
+    plain = plain_field.render(origins, directions)
+    # Sums of 64 samples in float32, and corners' features summed in another order.
+    torch.testing.assert_close(plain, ours, atol=1e-5, rtol=0)
+    target = torch.rand(20, 3)
+    for picture in (ours, plain):
+        (picture - target).square().sum().backward()
+    torch.testing.assert_close(plain_field.encoding.hash_table.grad, residual.grid.table.grad, atol=1e-4, rtol=1e-3)
+    with torch.no_grad():
+        torch.testing.assert_close(plain_field.render(origins, directions), plain)
+
+
+def test_arf_written_out_gives_our_loss_and_gradient(monkeypatch):
+    generator = torch.Generator().manual_seed(0)
+    view, style, content = (torch.rand(rows, 24, generator=generator) for rows in (50, 70, 50))
+    monkeypatch.setattr(nnfm, "SIMILARITIES_AT_ONCE", 16 * len(style))
+    torch.testing.assert_close(nnfm.arf_nnfm(view, style), nnfm_loss(view, style))
+    for one, other in zip(
+        nnfm.forward_backward(nnfm.ours, view, style, content),
+        nnfm.forward_backward(nnfm.reference, view, style, content),
+        strict=True,
+    ):
+        torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-4)
+
+
+def test_contenders_that_differ_are_not_timed():
+    with pytest.raises(RuntimeError, match=r"colours: the contenders differ by 0\.5"):
+        _measure.check_equal(torch.tensor([1.0, 3.0]), torch.tensor([2.0, 2.0]), "colours", 1e-3)
+
+
+def test_vanilla_nerf_is_made_without_a_network_and_with_its_own_settings(llff_scene, painting, options):
+    options = stage1.Stage1Options(**vars(options))
+    scene = _scene.Scene("tiny", llff_scene, painting)
+    contender = stage1.make_training("vanilla-nerf", scene, options, CPU, seed=0)
+    pipeline = contender.pipeline
+    assert type(pipeline.model).__module__ == "nerfstudio.models.vanilla_nerf"
+    assert pipeline.datamanager.config.train_num_rays_per_batch == 1024
+    assert type(contender.optimizers.optimizers["fields"]).__name__ == "RAdam"
+    assert 1.0 < pipeline.model.collider.near_plane < pipeline.model.collider.far_plane
+    pipeline.datamanager.config.train_num_rays_per_batch = 8
+    before = [parameter.clone() for parameter in pipeline.model.parameters()]
+    contender.step()
+    assert any(not torch.equal(old, new) for old, new in zip(before, pipeline.model.parameters(), strict=True))
+
+
+def test_a_benchmark_can_be_run_as_a_command(tmp_path):
+    command = [sys.executable, "-m", "benchmarks.hash_grid", "--quick", "--repeats", "1", "--device", "cpu"]
+    done = subprocess.run([*command, "--output-dir", str(tmp_path)], cwd=_measure.ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    content = json.loads((tmp_path / "hash_grid.json").read_text())
+    assert content["quick"]
+    assert [row["name"] for row in content["rows"]] == ["hash_grid_forward", "hash_grid_forward_backward"]
+    assert all(len(one["seconds"]) == 1 for part in content["repetitions"].values() for one in part.values())
