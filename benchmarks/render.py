@@ -46,7 +46,9 @@ def main(options: RenderOptions) -> None:
     report = Report("render", options)
     scene = find_scene(options)
     coarse = find_or_train_coarse(scene, options)
-    training = Training(style_config(scene, coarse, SIDE, options), report.device, coarse)
+    config = style_config(scene, coarse, SIDE, options)
+    config.pipeline.warm_start_steps = min(config.pipeline.warm_start_steps, options.style_iterations)
+    training = Training(config, report.device, coarse)
     iterations = 1 if options.quick else options.style_iterations
     for _ in range(iterations):
         training.step()
