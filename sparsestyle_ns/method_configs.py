@@ -64,7 +64,7 @@ def _hier_style(draft: bool) -> TrainerConfig:
             model=HierStyleModelConfig(
                 num_steps=64,
                 occupancy_resolution=96,
-                # A quarter of the paper's, as the images are: cells finer than the photos' pixels don't reach new views.
+                # A quarter of the paper's, as the images are: cells finer than pixels don't reach new views.
                 min_resolution=32,
                 max_resolution=128,
             )

@@ -79,8 +79,8 @@ class HierStyleModelConfig(ModelConfig):
     scene's first picture takes as long as an exact one, those from near by a small part of that, also on a CPU. The
     viewer has a control for it; for ns-render, write `render_mode: baked` into the run's config.yml."""
     bake_resolution: int = 256
-    """Cells along the cube's side in baked rendering. Each brick of 8³ that rays have been to takes 4 KiB: at most 147 MB
-    with 256, 482 MB with 384."""
+    """Cells along the cube's side in baked rendering. Each brick of 8³ that rays have been to takes 4 KiB: at most
+    147 MB with 256, 482 MB with 384."""
     eval_num_rays_per_chunk: int = 8192
     """Rays rendered at once outside of training."""
 

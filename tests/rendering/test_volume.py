@@ -254,8 +254,8 @@ def test_the_memory_of_frozen_samples_is_that_of_their_tensors(coarse, residual,
     frozen = freeze(coarse, residual, rays)
     samples = 11 * STEPS
     assert frozen.num_rays == RAYS and len(frozen.density) == samples
-    # Ray index (8 bytes), s, length, three coordinates in the cube and three in the hash grid, density and four features
-    # (4 bytes each).
+    # Ray index (8 bytes), s, length, three coordinates in the cube and three in the hash grid, density and four
+    # features (4 bytes each).
     assert frozen.num_bytes == samples * (8 + 4 * (1 + 1 + 3 + 3 + 1 + FEATURES))
 
 
