@@ -77,7 +77,7 @@ def test_drafts_are_the_same_methods_with_other_numbers() -> None:
         full, draft = method_config(method), method_config(f"{method}-draft")
         assert type(full) is type(draft)
         assert type(full.pipeline.model) is type(draft.pipeline.model)
-        assert draft.max_num_iterations < full.max_num_iterations
+        assert draft.max_num_iterations <= full.max_num_iterations
         assert draft.pipeline.datamanager.max_image_side < full.pipeline.datamanager.max_image_side
 
 
@@ -144,6 +144,27 @@ def test_a_stylised_run_renders_without_painting_weights_and_coarse_run(
         pictures = sorted((tmp_path / "test" / name).glob("*.jpg"))
         assert [path.stem for path in pictures] == ["image000", "image008"]
         assert iio.imread(pictures[0]).shape[:2] == (24, 32)
+
+
+def test_a_run_renders_from_voxels_when_its_config_says_so(
+    runs: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sparsestyle_ns.rendering.baked import BakedVolume
+
+    filled = []
+    fill = BakedVolume.fill
+    monkeypatch.setattr(BakedVolume, "fill", lambda volume, cells: (filled.append(len(cells)), fill(volume, cells)))
+    text = (runs.style / "config.yml").read_text()
+    assert "    render_mode: exact\n" in text
+    pictures = {}
+    for mode in ("exact", "baked"):
+        (tmp_path / mode).mkdir()
+        (tmp_path / mode / "config.yml").write_text(text.replace("render_mode: exact", f"render_mode: {mode}"))
+        flags = ["--split", "test", "--rendered-output-names", "rgb", "--image-format", "png"]
+        render("dataset", tmp_path / mode, tmp_path / mode, *flags)
+        pictures[mode] = iio.imread(tmp_path / mode / "test" / "rgb" / "image000.png").astype(float)
+        assert bool(filled) == (mode == "baked")
+    assert np.abs(pictures["exact"] - pictures["baked"]).mean() < 3  # of 255
 
 
 @pytest.mark.parametrize("kind", ["coarse", "style"])
