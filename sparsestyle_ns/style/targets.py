@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestyle_ns.losses.content import content_loss
-from sparsestyle_ns.losses.nnfm import nnfm_loss
+from sparsestyle_ns.losses.nnfm import StyleIndex, nnfm_loss
 from sparsestyle_ns.style.vgg import VGGFeatures
 
 
@@ -46,7 +46,7 @@ class StyleTargets:
         self.feature_side = feature_side
         self.style_image = style_image
         with torch.no_grad():
-            self.style_rows = feature_rows(backbone(fit_side(style_image[None], style_side)))
+            self.style = StyleIndex(feature_rows(backbone(fit_side(style_image[None], style_side))))
 
     def features(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 768 h w"]:
         """The network's view of a picture."""
@@ -73,4 +73,4 @@ class StyleTargets:
             )
             if covered.any():
                 features, target = features[covered], target[covered]
-        return nnfm_loss(features, self.style_rows), content_loss(features, target)
+        return nnfm_loss(features, self.style), content_loss(features, target)

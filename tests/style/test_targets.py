@@ -30,7 +30,7 @@ def test_losses_are_those_of_all_features_where_nothing_is_transparent():
     content = targets.features(photo)
     style, moved = targets.losses(image, content)
     rows = feature_rows(targets.features(image))
-    torch.testing.assert_close(style, nnfm_loss(rows, targets.style_rows))
+    torch.testing.assert_close(style, nnfm_loss(rows, targets.style))
     torch.testing.assert_close(moved, content_loss(rows, feature_rows(content)))
     for same in zip(targets.losses(image, content, torch.ones(16, 16)), (style, moved), strict=True):
         torch.testing.assert_close(*same)
