@@ -61,10 +61,6 @@ class CoarseFewShotModelConfig(ModelConfig):
     """guided: samples go where a grid remembers density; even: evenly over the ray, jittered, as NeRF's first pass."""
     num_samples: int = 24
     """Samples a ray in training."""
-    early_num_samples: int = 16
-    """Samples a ray at first, as long as the field is smooth fog that few samples show as well; as num_samples: off."""
-    early_share: float = 0.2
-    """Share of the iterations, in [0, 1], that counts as early."""
     num_eval_samples: int = 64
     """Samples a ray in rendering."""
     num_bins: int = 64
@@ -139,12 +135,6 @@ class CoarseFewShotModel(Model):
         since = self.step / self.num_steps - self.config.distortion_start
         return min(1.0, max(0.0, since / self.config.distortion_ramp))
 
-    def num_training_samples(self) -> int:
-        """Samples a ray in this iteration."""
-        config = self.config
-        early = self.step < config.early_share * self.num_steps
-        return min(config.early_num_samples, config.num_samples) if early else config.num_samples
-
     def _generator(self) -> torch.Generator:
         return torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + self.step)
 
@@ -174,7 +164,7 @@ class CoarseFewShotModel(Model):
             render, segments, _ = self.render(ray_bundle, self.config.num_eval_samples, None)
             depth = segments.distance(render.s.clamp(max=1.0 - 1e-4))
             return {"rgb": render.rgb, "accumulation": render.accumulation, "depth": depth}
-        render, _, edges = self.render(ray_bundle, self.num_training_samples(), self._generator())
+        render, _, edges = self.render(ray_bundle, self.config.num_samples, self._generator())
         if self.grid is not None:
             self.grid.remember(render.positions, render.density)
         return {
