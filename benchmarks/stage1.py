@@ -96,7 +96,7 @@ def even_config(scene: Scene, options: Stage1Options) -> Any:
     """The same with even samples on every ray, as NeRF's first pass."""
     config = our_config(scene, options)
     model = config.pipeline.model
-    model.sampling, model.num_samples, model.early_num_samples = "even", EVEN_SAMPLES, EVEN_SAMPLES
+    model.sampling, model.num_samples = "even", EVEN_SAMPLES
     return config
 
 
