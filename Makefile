@@ -43,8 +43,10 @@ else
 endif
 
 bench: $(READY)
-	set -e; for name in hash_grid nnfm stage2_step render memory scaling stage1; do \
+	set -e; for name in hash_grid nnfm stage2_step render memory scaling; do \
 	    $(BIN)/python -m benchmarks.$$name $(BENCH); \
+	done; for peer in even vanilla-nerf; do \
+	    $(BIN)/python -m benchmarks.stage1 --peer $$peer $(BENCH); \
 	done
 	$(BIN)/python -m benchmarks.summary $(BENCH)
 
