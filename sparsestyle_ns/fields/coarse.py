@@ -1,6 +1,6 @@
 """The coarse field F_c (Eq. 1): what a scene looks like from afar, learned from three to eight photos."""
 
-from typing import Dict, Literal, Optional, Tuple
+from typing import Dict, List, Literal, Optional, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -12,6 +12,7 @@ from nerfstudio.fields.base_field import Field
 from torch import Tensor, nn
 
 from sparsestyle_ns.field_components.positional_encoding import PositionalEncoding
+from sparsestyle_ns.field_components.thinned_mlp import Thinning, thinned_mlp
 from sparsestyle_ns.fields.pieces import in_pieces
 
 DensityActivation = Literal["softplus", "exp"]
@@ -74,17 +75,34 @@ class CoarseField(Field):
         )
 
     def density_and_feature(
-        self, positions: Float[Tensor, "*batch 3"]
+        self, positions: Float[Tensor, "*batch 3"], thinning: Optional[Thinning] = None
     ) -> Tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch feature"]]:
-        """σ_c and e_c at field coordinates in [−1, 1]."""
-        density, feature = in_pieces(self._evaluate, positions.reshape(-1, 3))
+        """σ_c and e_c at field coordinates in [−1, 1].
+
+        Args:
+            thinning: spares the backward pass points that hardly matter (`thinned_mlp`); None: none.
+        """
+        points = positions.reshape(-1, 3)
+        if thinning is None:
+            density, feature = in_pieces(self._evaluate, points)
+        else:
+            raw, feature = thinned_mlp(
+                self.position_encoding(points), self._hidden, (self.density_head, self.feature_head), thinning
+            )
+            density = self._activate(raw)
         batch = positions.shape[:-1]
         return density.view(batch), feature.view(*batch, self.feature_dim)
 
+    @property
+    def _hidden(self) -> List[nn.Linear]:
+        return [layer for layer in self.trunk.modules() if isinstance(layer, nn.Linear)]
+
     def _evaluate(self, points: Float[Tensor, "points 3"]) -> Tuple[Tensor, Tensor]:
         hidden = self.trunk(self.position_encoding(points))
-        raw = self.density_head(hidden).squeeze(-1).float() + self.density_bias
-        return activate_density(raw, self.density_activation), self.feature_head(hidden)
+        return self._activate(self.density_head(hidden)), self.feature_head(hidden)
+
+    def _activate(self, raw: Float[Tensor, "points 1"]) -> Float[Tensor, "points"]:
+        return activate_density(raw.squeeze(-1).float() + self.density_bias, self.density_activation)
 
     def color(
         self, feature: Float[Tensor, "*batch feature"], directions: Float[Tensor, "*batch 3"]

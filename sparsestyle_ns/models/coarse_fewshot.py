@@ -12,6 +12,7 @@ from torch.nn import Parameter
 
 from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.field_components.positional_encoding import revealed_levels
+from sparsestyle_ns.field_components.thinned_mlp import Thinning
 from sparsestyle_ns.fields.coarse import CoarseField, DensityActivation
 from sparsestyle_ns.losses.geometry import near_density
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
@@ -65,6 +66,9 @@ class CoarseFewShotModelConfig(ModelConfig):
     """Samples a ray in rendering."""
     num_bins: int = 64
     """Bins of the histogram that guided samples follow."""
+    thinning: float = 2.0
+    """Samples whose gradient is smaller than this many times the batch's mean take part in the backward pass with a
+    probability in proportion only, and count for more where they do; 0: all samples take part."""
     even_share: float = 0.1
     """Share of guided samples, in (0, 1], that is spread evenly."""
     grid_resolution: int = 64
@@ -152,9 +156,10 @@ class CoarseFewShotModel(Model):
         """Renders rays; also returns their segments and the samples' borders."""
         segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
         edges = self.place_samples(segments, num_samples, generator)
+        thinning = Thinning(self.config.thinning, generator) if self.training and self.config.thinning > 0 else None
         with autocast(self.device, self.config.precision):
             render = render_coarse(
-                self.field, segments, ray_bundle.directions, edges, self.space.unbounded, self.background
+                self.field, segments, ray_bundle.directions, edges, self.space.unbounded, self.background, thinning
             )
         return render, segments, edges
 

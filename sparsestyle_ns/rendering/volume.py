@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestyle_ns.field_components.hash_grid import GridLocation
+from sparsestyle_ns.field_components.thinned_mlp import Thinning
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.rendering.compositing import (
@@ -69,11 +70,16 @@ def render_coarse(
     edges: Float[Tensor, "rays edges"],
     unbounded: bool,
     background: Optional[Float[Tensor, "3"]],
+    thinning: Optional[Thinning] = None,
 ) -> DenseRender:
-    """Renders the coarse field with the samples that `edges` bound (Eq. 1; NeRF, Eq. 3)."""
+    """Renders the coarse field with the samples that `edges` bound (Eq. 1; NeRF, Eq. 3).
+
+    Args:
+        thinning: of the field's backward pass; None: all samples are in it.
+    """
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
     positions = segments.positions(middle)
-    density, feature = field.density_and_feature(positions)
+    density, feature = field.density_and_feature(positions, thinning)
     color = field.color(feature, directions[:, None].expand_as(positions)).float()
     weights = dense_weights(optical_depth(density, interval_lengths(segments, edges, unbounded)))
     accumulation = weights.sum(dim=-1, keepdim=True)
