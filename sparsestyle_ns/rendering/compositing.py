@@ -19,6 +19,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sparsestyle_ns.rendering.precision import at_least_float32
+
 MAX_OPTICAL_DEPTH = 80.0
 """Beyond it exp(−τ) is below 2e-35, so an interval is opaque in every dtype; the cap keeps sums of τ exact when an
 interval is infinite."""
@@ -30,7 +32,7 @@ def optical_depth(density: Float[Tensor, "*batch"], interval: Float[Tensor, "*ba
     An infinite interval gives the cap, and 0 where the density is 0. Its gradient is that of an interval of length 1:
     the true one, infinite at σ = 0, would drown all others once a last sample has been emptied.
     """
-    density, interval = _at_least_float32(density), _at_least_float32(interval)
+    density, interval = at_least_float32(density), at_least_float32(interval)
     infinite = interval.isinf()
     # A density that overflowed would make no number in an interval of length 0.
     finite = density.clamp(max=torch.finfo(density.dtype).max)
@@ -41,7 +43,7 @@ def optical_depth(density: Float[Tensor, "*batch"], interval: Float[Tensor, "*ba
 
 def dense_weights(depth: Float[Tensor, "*rays samples"]) -> Float[Tensor, "*rays samples"]:
     """w_i = T_i (1 − exp(−τ_i)) from optical depths τ ≥ 0, dense layout (NeRF, Eq. 3)."""
-    return _DenseWeights.apply(_at_least_float32(depth))
+    return _DenseWeights.apply(at_least_float32(depth))
 
 
 class _DenseWeights(torch.autograd.Function):
@@ -73,7 +75,7 @@ def packed_transmittance(
     The running sum goes over all rays in float64, and each ray's start is taken off: with τ capped, the error of that
     difference stays below 1e-6 for ten million samples.
     """
-    depth = _at_least_float32(depth)
+    depth = at_least_float32(depth)
     before = F.pad(torch.cumsum(depth.double(), dim=0), (1, 0))
     counts = torch.bincount(ray_indices, minlength=num_rays)
     in_front = before[:-1] - before[torch.cumsum(counts, dim=0) - counts][ray_indices]
@@ -84,7 +86,7 @@ def packed_weights(
     depth: Float[Tensor, "samples"], ray_indices: Int[Tensor, "samples"], num_rays: int
 ) -> Float[Tensor, "samples"]:
     """w_i = T_i (1 − exp(−τ_i)), packed layout; the twin of `dense_weights`."""
-    return _PackedWeights.apply(_at_least_float32(depth), ray_indices, num_rays)
+    return _PackedWeights.apply(at_least_float32(depth), ray_indices, num_rays)
 
 
 class _PackedWeights(torch.autograd.Function):
@@ -142,7 +144,3 @@ def distortion(weights: Float[Tensor, "*rays samples"], edges: Float[Tensor, "*r
     between = ((edges[..., 2:] - edges[..., :-2]) * before * behind).sum(dim=-1)
     within = (weights.square() * (edges[..., 1:] - edges[..., :-1])).sum(dim=-1) / 3.0
     return between + within
-
-
-def _at_least_float32(values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    return values.to(torch.promote_types(values.dtype, torch.float32))
