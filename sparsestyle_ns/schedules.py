@@ -1,4 +1,6 @@
-"""How strongly the content holds on while a scene is stylised."""
+"""How strongly a loss counts at an iteration: content while a scene is stylised, regularisers that set in later."""
+
+import math
 
 from sparsestyle_ns.errors import InputError
 
@@ -16,7 +18,7 @@ def content_weight(step: int, initial: float, decay: float, duration: int) -> fl
         duration: T ≥ 0, the iterations the fall takes; the paper's is 100.
 
     Raises:
-        InputError: an argument is negative or not a number.
+        InputError: an argument is negative, infinite or not a number.
 
     Example:
         >>> content_weight(step=50, initial=10.0, decay=0.01, duration=100)
@@ -24,8 +26,26 @@ def content_weight(step: int, initial: float, decay: float, duration: int) -> fl
     """
     arguments = {"iteration": step, "initial value": initial, "decay factor": decay, "duration in iterations": duration}
     for name, value in arguments.items():
-        if not value >= 0:
-            raise InputError(f"The content weight's {name} is {value}: give a number that is 0 or more.")
+        if not 0 <= value < math.inf:
+            raise InputError(f"The content weight's {name} is {value}: give a finite number that is 0 or more.")
     if step >= duration:
         return initial * decay
     return initial * decay ** (step / duration)
+
+
+def ramp(progress: float, start: float, length: float) -> float:
+    """A share that rises evenly from 0 at `start` to 1 at `start + length`; a step where `length` is 0.
+
+    Args:
+        progress: share of the iterations that is over, 0 or more.
+        start: share of the iterations at which it begins to rise.
+        length: share of the iterations that it takes, 0 or more.
+
+    Example:
+        >>> ramp(0.5, start=0.25, length=0.5)
+        0.5
+    """
+    since = progress - start
+    if since >= length:
+        return 1.0
+    return since / length if since > 0 else 0.0

@@ -5,12 +5,27 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import List
 
+import hypothesis
 import numpy as np
 import pytest
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "data_scripts")]
+pytest_plugins = ["hard.table"]
+
+# The same few examples in each run; `pytest --hypothesis-profile thorough` looks for new ones.
+hypothesis.settings.register_profile(
+    "quick",
+    max_examples=20,
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow, hypothesis.HealthCheck.function_scoped_fixture],
+)
+hypothesis.settings.register_profile(
+    "thorough", hypothesis.settings.get_profile("quick"), max_examples=200, derandomize=False
+)
+hypothesis.settings.load_profile("quick")
 
 TINY = [
     *("--pipeline.datamanager.train-num-rays-per-batch", "128"),

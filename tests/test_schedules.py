@@ -42,5 +42,5 @@ def test_without_a_duration_the_fall_is_over_from_the_first_iteration_on(step):
 @pytest.mark.parametrize("value", [-1, float("nan")])
 def test_a_negative_argument_is_refused_by_name(argument, name, value):
     arguments = {"step": 0, "initial": 10.0, "decay": 0.01, "duration": 100} | {argument: value}
-    with pytest.raises(InputError, match=rf"content weight's {name}.* is {value}: give a number that is 0 or more"):
+    with pytest.raises(InputError, match=rf"content weight's {name}.* is {value}: give a finite number"):
         content_weight(**arguments)

@@ -99,7 +99,7 @@ class _GatherSum(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad: Tensor) -> Tuple[Tensor, None]:
         rows, weights = ctx.corners
-        bags = grad.reshape(rows.shape[0] * rows.shape[1], 1, -1)
+        bags = grad.reshape(rows.shape[0] * rows.shape[1], 1, grad.shape[-1] // rows.shape[1])
         parts = weights.to(grad.dtype).reshape(-1, 8, 1) * bags
         table_grad = grad.new_zeros(ctx.rows, parts.shape[-1])
         return table_grad.index_add_(0, rows.flatten().long(), parts.flatten(0, 1)), None

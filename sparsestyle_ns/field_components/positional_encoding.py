@@ -19,7 +19,8 @@ def positional_encoding(
     """γ(x) of Eq. 1: [x, sin(x), cos(x), sin(2x), cos(2x), …, sin(2^(L−1) x), cos(2^(L−1) x)].
 
     Args:
-        x: coordinates, of any length unit; useful when they lie in about [−1, 1].
+        x: coordinates, of any length unit; useful when they lie in about [−1, 1]. 2^(L−1) x must be below float32's
+            largest number; angles of half-precision coordinates are computed, and returned, in float32.
         num_levels: L, the number of octaves. 0 gives x alone.
         level_weights: one factor in [0, 1] for each octave (see `revealed_levels`), or None for all ones.
 
@@ -28,6 +29,7 @@ def positional_encoding(
     """
     if num_levels == 0:
         return x
+    x = x.to(torch.promote_types(x.dtype, torch.float32))
     frequencies = torch.exp2(torch.arange(num_levels, device=x.device, dtype=x.dtype))
     angles = x[..., None, :] * frequencies[:, None]
     waves = torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1)

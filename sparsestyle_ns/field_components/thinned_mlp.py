@@ -14,6 +14,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from sparsestyle_ns.rendering.precision import at_least_float32
+
 
 class Thinning(NamedTuple):
     """How many points the backward pass is spared.
@@ -82,7 +84,7 @@ class _ThinnedMLP(torch.autograd.Function):
         dtype = weights[0].dtype
         kept: Any = slice(None)
         if ctx.thinning.threshold > 0:
-            kept, gradients = thin(gradients.float() if dtype != torch.float64 else gradients, ctx.thinning)
+            kept, gradients = thin(at_least_float32(gradients), ctx.thinning)
         gradients = gradients.to(dtype)
         found = []
         for number in reversed(range(num_layers)):

@@ -1,5 +1,6 @@
 """The coarse field F_c (Eq. 1): what a scene looks like from afar, learned from three to eight photos."""
 
+import math
 from typing import Dict, List, Literal, Optional, Tuple
 
 import torch
@@ -16,13 +17,16 @@ from sparsestyle_ns.field_components.thinned_mlp import Thinning, thinned_mlp
 from sparsestyle_ns.fields.pieces import in_pieces
 
 DensityActivation = Literal["softplus", "exp"]
+MAX_LOG_DENSITY = 15.0
+"""ln of the largest density, 3e6 per half side of the cube: opaque within a thousandth of a hash cell, and far from
+float32's largest number, which products with intervals and sums must not reach."""
 
 
 def activate_density(raw: Float[Tensor, "*batch"], activation: DensityActivation) -> Float[Tensor, "*batch"]:
-    """σ ≥ 0 from an unbounded number. `exp` is capped at e^15 so that it stays finite in float16's neighbours."""
+    """σ, from 0 to e^`MAX_LOG_DENSITY`, from any number, infinite ones included."""
     if activation == "exp":
-        return torch.exp(raw.clamp(max=15.0))
-    return F.softplus(raw)
+        return torch.exp(raw.clamp(max=MAX_LOG_DENSITY))
+    return F.softplus(raw.clamp(max=math.exp(MAX_LOG_DENSITY)))
 
 
 class CoarseField(Field):
@@ -71,7 +75,6 @@ class CoarseField(Field):
             num_layers=2,
             layer_width=layer_width // 2,
             out_dim=3,
-            out_activation=nn.Sigmoid(),
         )
 
     def density_and_feature(
@@ -117,7 +120,8 @@ class CoarseField(Field):
     def _evaluate_color(self, feature: Tensor, directions: Tensor) -> Tuple[Tensor]:
         if self.direction_encoding is not None:
             feature = torch.cat([feature, self.direction_encoding(directions).to(feature)], dim=-1)
-        return (self.color_head(feature),)
+        # In half precision a sigmoid reaches 1 at a logit of 6, and has no gradient from there on.
+        return (torch.sigmoid(self.color_head(feature).float()),)
 
     def get_density(self, ray_samples: RaySamples) -> Tuple[Tensor, Tensor]:
         """nerfstudio's form of `density_and_feature`; the samples' positions are field coordinates."""

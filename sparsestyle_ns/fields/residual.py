@@ -90,8 +90,9 @@ class ResidualField(nn.Module):
 
     def _evaluate(self, encoded: Tensor, feature: Tensor, coarse_density: Tensor) -> Tuple[Tensor, Tensor]:
         hidden = self.mlp(torch.cat([encoded, feature], dim=-1))
-        color = torch.sigmoid(self.color_head(hidden))
+        # In half precision a sigmoid reaches 1 at a logit of 6, and has no gradient from there on.
+        color = torch.sigmoid(self.color_head(hidden).float())
         if self.density_head is None:
             return coarse_density, color
-        residual = self.density_scale * self.density_head(hidden).squeeze(-1)
+        residual = self.density_scale * self.density_head(hidden).squeeze(-1).float()
         return fine_density(residual, coarse_density), color

@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestyle_ns.rendering.precision import at_least_float32
+
 
 def content_loss(features: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
     """Squared error of features, relative to the size of the target's (L_content of Eq. 5).
@@ -32,6 +34,9 @@ def content_loss(features: Float[Tensor, "*shape"], target: Float[Tensor, "*shap
     """
     if features.shape != target.shape:
         raise ValueError(f"features are {tuple(features.shape)} and the target {tuple(target.shape)}: they must agree")
-    target = target.detach()
-    size = target.square().mean()
-    return (features - target).square().mean() / torch.where(size > 0, size, torch.ones_like(size))
+    features, target = at_least_float32(features), at_least_float32(target.detach())
+    # In units of the largest number of the target no square of it overflows, and none underflows that matters.
+    largest = torch.linalg.vector_norm(target, ord=torch.inf)
+    unit = torch.where(largest > 0, largest, 1.0)
+    size = torch.where(largest > 0, (target / unit).square().mean(), 1.0)
+    return ((features - target) / unit).square().mean() / size

@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from sparsestyle_ns.rendering.precision import at_least_float32, without_autocast
+
 CHUNK_SIZE = 2048
 """Feature vectors compared at once; 2048 × 2048 similarities are 16 MiB in float32."""
 
@@ -61,6 +63,7 @@ class StyleIndex:
     """
 
     @torch.no_grad()
+    @without_autocast
     def __init__(self, style_features: Float[Tensor, "M C"], block_size: Optional[int] = None) -> None:
         _check_style(style_features)
         directions = _directions(style_features)
@@ -81,6 +84,7 @@ class StyleIndex:
         return self.blocks.flatten(0, 1)[self._places[rows]]
 
     @torch.no_grad()
+    @without_autocast
     def nearest(self, features: Float[Tensor, "N C"]) -> Int[Tensor, " N"]:
         """As `nearest_neighbors`; of style vectors with equal directions the first is given."""
         rows_at_once = max(1, TABLE_SIZE // len(self.blocks))
@@ -143,6 +147,7 @@ class _Matches:
         return nearest.scatter_reduce_(0, rows[is_best], found, "amin", include_self=False)
 
 
+@without_autocast
 def nearest_neighbors(
     features: Float[Tensor, "N C"],
     style_features: Union[Float[Tensor, "M C"], StyleIndex],
@@ -151,7 +156,8 @@ def nearest_neighbors(
     """For each feature vector the style's most similar one, by cosine.
 
     The search is exact and compares everything with everything, but holds at most `chunk_size`² similarities at a
-    time, so its memory does not grow with the number of pixels. No gradient passes.
+    time, so its memory does not grow with the number of pixels. No gradient passes. Similarities have at least
+    float32's digits, also of half-precision features and under autocast.
 
     Args:
         features: one vector a row.
@@ -174,6 +180,7 @@ def nearest_neighbors(
         return torch.cat(chunks)
 
 
+@without_autocast
 def nnfm_loss(
     features: Float[Tensor, "N C"],
     style_features: Union[Float[Tensor, "M C"], StyleIndex],
@@ -208,10 +215,11 @@ def nnfm_loss(
         matches = style_features.directions_of(neighbors)
     else:
         matches = _directions(style_features.detach()[neighbors])
+    features = at_least_float32(features)
     length = torch.linalg.vector_norm(features, dim=-1)
     # The features' directions themselves would be one more large tensor to fill, keep and differentiate.
     cosines = torch.linalg.vecdot(features, matches) / length.clamp_min(SHORTEST)
-    return (1 - torch.where(length > SHORTEST, cosines, 0.0)).mean()
+    return (1 - torch.where(length > SHORTEST, cosines.clamp(-1.0, 1.0), 0.0)).mean()
 
 
 def _check_style(style_features: Float[Tensor, "M C"]) -> None:
@@ -234,6 +242,7 @@ def _nearest_of_chunk(
 
 def _directions(vectors: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
     """Vectors of length 1, or of length 0 where there is no direction."""
+    vectors = at_least_float32(vectors)
     length = torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
     return torch.where(length > SHORTEST, vectors / length.clamp_min(SHORTEST), 0.0)
 

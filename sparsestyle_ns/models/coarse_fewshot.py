@@ -22,6 +22,7 @@ from sparsestyle_ns.rendering.precision import Precision, autocast
 from sparsestyle_ns.rendering.sampling import even_edges
 from sparsestyle_ns.rendering.space import Segments, make_space
 from sparsestyle_ns.rendering.volume import DenseRender, render_coarse
+from sparsestyle_ns.schedules import ramp
 
 
 @dataclass
@@ -78,7 +79,7 @@ class CoarseFewShotModelConfig(ModelConfig):
     distortion_start: float = 0.4
     """Share of the iterations after which the distortion loss sets in."""
     distortion_ramp: float = 0.3
-    """Share of the iterations, above 0, in which it then grows to its weight."""
+    """Share of the iterations in which it then grows to its weight; 0 is at once."""
     occlusion_weight: float = 0.0
     """Weight of density close to the camera (FreeNeRF's occlusion loss); 0 is off."""
     occlusion_range: float = 0.1
@@ -136,8 +137,7 @@ class CoarseFewShotModel(Model):
 
     def _distortion_share(self) -> float:
         """How much of its weight the distortion loss has in this iteration, in [0, 1]."""
-        since = self.step / self.num_steps - self.config.distortion_start
-        return min(1.0, max(0.0, since / self.config.distortion_ramp))
+        return ramp(self.step / self.num_steps, self.config.distortion_start, self.config.distortion_ramp)
 
     def _generator(self) -> torch.Generator:
         return torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + self.step)

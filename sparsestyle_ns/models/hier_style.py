@@ -197,8 +197,8 @@ class HierStyleModel(Model):
                 feature = feature.float()
                 fine_density, fine_color = self.residual(self.residual.locate(points), feature, density)
                 colors = [self.field.color(feature, direction.expand_as(points)) for direction in directions]
-                color = torch.stack(colors).float().mean(dim=0)
-            return torch.cat([density[:, None], fine_density[:, None], fine_color.float(), color], dim=-1)
+                color = torch.stack(colors).mean(dim=0)
+            return torch.cat([density[:, None], fine_density[:, None], fine_color, color], dim=-1)
 
         return BakedVolume(shade, resolution, self.device)
 

@@ -25,8 +25,8 @@ class Lines(NamedTuple):
     """Rays, in the two forms that segments have.
 
     Attributes:
-        values: start and extent of a straight segment in field coordinates, or origin and direction of a ray that the
-            contraction bends; six numbers a ray.
+        values: start and extent of a straight segment in field coordinates, or origin, in the contraction's unit, and
+            direction of a ray that it bends; six numbers a ray.
         hit: whether a ray meets the scene.
         bent: which of the two forms it is.
         unbounded: whether the last interval is infinite.

@@ -27,6 +27,12 @@ def interval_lengths(
     return torch.cat([lengths[:, :-1], last], dim=-1)
 
 
+def grid_cells(positions: Float[Tensor, "*batch 3"], resolution: int) -> Int[Tensor, "*batch 3"]:
+    """Indices of the cells of the cube [−1, 1]³ that positions lie in; outside of it the nearest cell's."""
+    # Cut off before they become integers, which have no numbers for the farthest points.
+    return ((0.5 * positions + 0.5) * resolution).clamp(0, resolution - 1).long()
+
+
 class DensityGrid(nn.Module):
     """σ per cell of the cube [−1, 1]³.
 
@@ -44,7 +50,7 @@ class DensityGrid(nn.Module):
 
     def cells(self, positions: Float[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
         """The cell each position lies in; positions outside the cube belong to the nearest cell."""
-        index = ((0.5 * positions + 0.5) * self.resolution).long().clamp(0, self.resolution - 1)
+        index = grid_cells(positions, self.resolution)
         return (index[..., 0] * self.resolution + index[..., 1]) * self.resolution + index[..., 2]
 
     @torch.no_grad()
@@ -127,7 +133,7 @@ class Occupancy(nn.Module):
 
     def contains(self, positions: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
         """Whether positions lie in occupied cells; positions outside the cube belong to the nearest cell."""
-        index = ((0.5 * positions + 0.5) * self.resolution).long().clamp(0, self.resolution - 1)
+        index = grid_cells(positions, self.resolution)
         return self.occupied[index[..., 0], index[..., 1], index[..., 2]]
 
 

@@ -23,7 +23,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 MIN_FORWARD = 1e-6
-"""Smallest -d_z / |d| of a ray that counts as pointing forward, and smallest -z / n of a point with an image in NDC."""
+"""Smallest -d_z / |d| of a ray that counts as pointing forward, |d| its largest coordinate, whose square need not
+exist; and smallest -z / n of a point with an image in NDC."""
 
 
 def ndc_points(
@@ -120,6 +121,6 @@ def _forward(
 ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch 1"], Bool[Tensor, "*batch 1"]]:
     """(d_x/d_z, d_y/d_z), d_z, and which rays point forward; the others get the values of direction (0, 0, -1)."""
     z = directions[..., 2:]
-    valid = z < -MIN_FORWARD * torch.linalg.vector_norm(directions.detach(), dim=-1, keepdim=True)
+    valid = z < -MIN_FORWARD * directions.detach().abs().amax(dim=-1, keepdim=True)
     forward_z = torch.where(valid, z, -1.0)
     return torch.where(valid, directions[..., :2], 0.0) / forward_z, forward_z, valid

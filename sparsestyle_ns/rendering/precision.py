@@ -1,10 +1,16 @@
-"""Which number format the coarse field's matrix products run in."""
+"""Which number format matrix products run in, and what must not run in fewer digits than float32 has."""
 
+import functools
+import itertools
 from contextlib import AbstractContextManager
-from typing import Literal
+from typing import Callable, Literal, ParamSpec, TypeVar
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+P = ParamSpec("P")
+R = TypeVar("R")
 Precision = Literal["auto", "float32", "bfloat16"]
 
 
@@ -25,3 +31,20 @@ def autocast(device: torch.device, precision: Precision) -> AbstractContextManag
     """
     enabled = precision == "bfloat16" or (precision == "auto" and multiplies_bfloat16(device))
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=enabled)
+
+
+def at_least_float32(values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Values of half precision in float32, others as they are."""
+    return values.to(torch.promote_types(values.dtype, torch.float32))
+
+
+def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
+    """Makes `function` compute in the number format of its arguments, of which one is a tensor, under autocast too."""
+
+    @functools.wraps(function)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        tensors = (value for value in itertools.chain(args, kwargs.values()) if isinstance(value, Tensor))
+        with torch.autocast(next(tensors).device.type, enabled=False):
+            return function(*args, **kwargs)
+
+    return wrapper

@@ -6,6 +6,7 @@ s is the normalised distance along the part of a ray that lies in the scene: 0 a
 from typing import Optional
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -19,11 +20,12 @@ def even_edges(
         generator: source of random numbers; each inner border is moved by up to half a step (stratified sampling).
             None gives even borders.
     """
-    edges = torch.linspace(0.0, 1.0, num_samples + 1, device=device).expand(num_rays, -1)
     if generator is None:
-        return edges
+        return torch.linspace(0.0, 1.0, num_samples + 1, device=device).expand(num_rays, -1)
     jitter = torch.rand(num_rays, num_samples - 1, device=device, generator=generator) - 0.5
-    return torch.cat([edges[:, :1], edges[:, 1:-1] + jitter / num_samples, edges[:, -1:]], dim=-1)
+    # Whole steps and jitter are added first: neighbours that touch can then not change places by rounding.
+    inner = (torch.arange(1, num_samples, device=device) + jitter) / num_samples
+    return F.pad(F.pad(inner, (1, 0), value=0.0), (0, 1), value=1.0)
 
 
 def edges_from_histogram(
@@ -47,7 +49,7 @@ def edges_from_histogram(
     right = torch.searchsorted(cdf, quantiles, right=True).clamp(1, weights.shape[-1])
     left = right - 1
     cdf_left, cdf_right = cdf.gather(-1, left), cdf.gather(-1, right)
-    edge_left, edge_right = edges.gather(-1, left), edges.gather(-1, right)
     fraction = (quantiles - cdf_left) / (cdf_right - cdf_left).clamp(min=torch.finfo(cdf.dtype).eps)
-    inner = edge_left + fraction.clamp(0.0, 1.0) * (edge_right - edge_left)
+    # Unlike left + fraction · (right − left), it never passes the right border by rounding.
+    inner = torch.lerp(edges.gather(-1, left), edges.gather(-1, right), fraction.clamp(0.0, 1.0))
     return torch.cat([edges[:, :1], inner, edges[:, -1:]], dim=-1)

@@ -9,7 +9,7 @@ the cube, so that the scale of the world's coordinates doesn't matter.
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Dict, Optional, Tuple
+from typing import Any, Dict, Optional, Tuple, Union
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -19,7 +19,8 @@ from torch import Tensor, nn
 from sparsestyle_ns.rendering.ndc import ndc_distance, ndc_rays
 
 MAX_DISTANCE = 1e4
-"""The distance, in world units, that stands for infinity in depth maps."""
+"""The distance that stands for infinity in depth maps, in units of the scene: of the near plane's distance in a
+forward-facing space, of the contraction's unit in a contracted one."""
 
 
 class Segments(ABC):
@@ -39,7 +40,7 @@ class Segments(ABC):
 
     @abstractmethod
     def distance(self, s: Float[Tensor, "rays 1"]) -> Float[Tensor, "rays 1"]:
-        """Distance from the ray's origin in world units, at most `MAX_DISTANCE`."""
+        """Distance from the ray's origin in world units, at most `MAX_DISTANCE` of the scene's."""
 
 
 @dataclass
@@ -74,7 +75,7 @@ class ForwardFacingSegments(LinearSegments):
     def distance(self, s: Tensor) -> Tensor:
         """See `Segments.distance`."""
         t_ndc = self.first + s * (self.last - self.first)
-        return ndc_distance(t_ndc, self.origins, self.directions, self.near, max_distance=MAX_DISTANCE)
+        return ndc_distance(t_ndc, self.origins, self.directions, self.near, max_distance=MAX_DISTANCE * self.near)
 
 
 @dataclass
@@ -92,15 +93,22 @@ class BoxSegments(LinearSegments):
 
 @dataclass
 class ContractedSegments(Segments):
-    """Segments of world rays, bent by the contraction; s is linear up to distance 1 and in disparity beyond."""
+    """Segments of world rays, bent by the contraction; s is linear up to distance 1 and in disparity beyond.
+
+    Origins and `near` are in multiples of `unit`, a length in the world.
+    """
 
     origins: Float[Tensor, "rays 3"]
     directions: Float[Tensor, "rays 3"]
     near: float
+    unit: float
     hit: Bool[Tensor, "rays"]
 
     def distance(self, s: Tensor) -> Tensor:
         """See `Segments.distance`."""
+        return self.unit * self._distance_in_units(s)
+
+    def _distance_in_units(self, s: Tensor) -> Tensor:
         start = spacing(torch.tensor(self.near))
         end = spacing(torch.tensor(MAX_DISTANCE))
         return inverse_spacing(start.to(s) + s * (end - start).to(s))
@@ -108,9 +116,9 @@ class ContractedSegments(Segments):
     def positions(self, s: Tensor, ray_indices: Optional[Tensor] = None) -> Tensor:
         """See `Segments.positions`."""
         if ray_indices is None:
-            points = self.origins[:, None] + self.distance(s)[..., None] * self.directions[:, None]
+            points = self.origins[:, None] + self._distance_in_units(s)[..., None] * self.directions[:, None]
         else:
-            points = self.origins[ray_indices] + self.distance(s)[:, None] * self.directions[ray_indices]
+            points = self.origins[ray_indices] + self._distance_in_units(s)[:, None] * self.directions[ray_indices]
         return contract(points)
 
     def lengths(self, edges: Tensor) -> Tensor:
@@ -130,13 +138,13 @@ def inverse_spacing(spaced: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 
 def contract(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """World points into [−1, 1]³: x/2 within the unit cube, (2 − 1/|x|) x/(2|x|) outside, |·| the largest coordinate.
+    """Points into [−1, 1]³: x/2 within the unit cube, (1 − 1/(2|x|)) x/|x| outside, |·| the largest coordinate.
 
     It is the contraction of mip-NeRF 360 (Eq. 10) with the maximum norm, halved.
     """
-    norm = points.abs().amax(dim=-1, keepdim=True)
-    outside = (2.0 - 1.0 / norm.clamp(min=1.0)) * points / norm.clamp(min=1.0)
-    return 0.5 * torch.where(norm < 1.0, points, outside)
+    norm = points.abs().amax(dim=-1, keepdim=True).clamp(min=1.0)
+    # Equal to x/2 at norm 1, and so everywhere within the cube. x/|x| comes first: the largest x has no double.
+    return (1.0 - 0.5 / norm) * (points / norm)
 
 
 def intersect_box(
@@ -144,7 +152,7 @@ def intersect_box(
     directions: Float[Tensor, "rays 3"],
     minimum: Float[Tensor, "3"],
     maximum: Float[Tensor, "3"],
-    near: float = 0.0,
+    near: Union[float, Float[Tensor, ""]] = 0.0,
 ) -> Tuple[Float[Tensor, "rays 1"], Float[Tensor, "rays 1"], Bool[Tensor, "rays"]]:
     """Distances at which rays enter and leave an axis-aligned box (the slab method).
 
@@ -160,8 +168,7 @@ def intersect_box(
     entry = torch.minimum(to_minimum, to_maximum).amax(dim=-1, keepdim=True).clamp(min=near)
     leave = torch.maximum(to_minimum, to_maximum).amin(dim=-1, keepdim=True)
     hit = leave > entry
-    start = torch.full_like(entry, near)
-    return torch.where(hit, entry, start), torch.where(hit, leave, start), hit.squeeze(-1)
+    return torch.where(hit, entry, near), torch.where(hit, leave, near), hit.squeeze(-1)
 
 
 class Space(nn.Module, ABC):
@@ -212,7 +219,8 @@ class ForwardFacingSpace(Space):
         """See `Space.segments`."""
         start, extent, valid = ndc_rays(origins, directions, self.focal_over_half_size, self.near)
         hit = valid.squeeze(-1)
-        scale = 2.0 / (self.maximum - self.minimum)
+        size = self.maximum - self.minimum
+        scale = 2.0 / torch.where(size > 0, size, 2.0)
         return ForwardFacingSegments(
             start=(start + self.first * extent - self.minimum) * scale - 1.0,
             extent=(self.last - self.first) * extent * scale * hit[:, None],
@@ -230,12 +238,12 @@ class BoxSpace(Space):
 
     Args:
         box: the box; its longest side becomes the cube's.
-        near: rays start no closer to the camera than this.
+        near: rays start no closer to the camera than this, in half sides of the cube.
     """
 
     unbounded = False
 
-    def __init__(self, box: SceneBox, near: float = 0.05) -> None:
+    def __init__(self, box: SceneBox, near: float = 1 / 30) -> None:
         super().__init__()
         self.register_buffer("minimum", box.aabb[0].float().clone())
         self.register_buffer("maximum", box.aabb[1].float().clone())
@@ -243,10 +251,10 @@ class BoxSpace(Space):
 
     def segments(self, origins: Tensor, directions: Tensor) -> BoxSegments:
         """See `Space.segments`."""
-        near, far, hit = intersect_box(origins, directions, self.minimum, self.maximum, self.near)
         center = 0.5 * (self.minimum + self.maximum)
         size = self.maximum - self.minimum
         scale = 2.0 / size.amax()
+        near, far, hit = intersect_box(origins, directions, self.minimum, self.maximum, self.near / scale)
         return BoxSegments(
             start=(origins + near * directions - center) * scale,
             extent=(far - near) * directions * scale,
@@ -261,23 +269,28 @@ class ContractedSpace(Space):
     """All of space, contracted, for cameras all around and a background beyond them.
 
     Args:
-        near: distance at which rays start, in world units.
+        unit: the length in the world, above 0, that the contraction takes as 1: coordinates below it aren't bent.
+        near: distance at which rays start, in that unit.
     """
 
     unbounded = True
 
-    def __init__(self, near: float = 0.05) -> None:
+    def __init__(self, unit: float = 1.0, near: float = 0.05) -> None:
         super().__init__()
+        self.unit = unit
         self.near = near
 
     def segments(self, origins: Tensor, directions: Tensor) -> ContractedSegments:
         """See `Space.segments`."""
         hit = torch.ones(len(origins), dtype=torch.bool, device=origins.device)
-        return ContractedSegments(origins=origins, directions=directions, near=self.near, hit=hit)
+        return ContractedSegments(origins / self.unit, directions, self.near, self.unit, hit)
 
 
 def make_space(scene_box: SceneBox, metadata: Dict[str, Any]) -> Space:
-    """The space that a dataset's metadata asks for: its key `space` is "ndc", "box" or "contracted"."""
+    """The space that a dataset's metadata asks for: its key `space` is "ndc", "box" or "contracted".
+
+    Coordinates within the scene box, which nerfstudio's dataparsers make for the cameras' size, aren't contracted.
+    """
     if metadata["space"] == "ndc":
         focal_over_half_size, depth_range = (
             tuple(metadata[key]) for key in ("ndc_focal_over_half_size", "ndc_depth_range")
@@ -285,4 +298,4 @@ def make_space(scene_box: SceneBox, metadata: Dict[str, Any]) -> Space:
         return ForwardFacingSpace(scene_box, focal_over_half_size, metadata["ndc_near"], depth_range)
     if metadata["space"] == "box":
         return BoxSpace(scene_box)
-    return ContractedSpace()
+    return ContractedSpace(unit=0.5 * (scene_box.aabb[1] - scene_box.aabb[0]).amax().item())

@@ -80,7 +80,7 @@ def render_coarse(
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
     positions = segments.positions(middle)
     density, feature = field.density_and_feature(positions, thinning)
-    color = field.color(feature, directions[:, None].expand_as(positions)).float()
+    color = field.color(feature, directions[:, None].expand_as(positions))
     weights = dense_weights(optical_depth(density, interval_lengths(segments, edges, unbounded)))
     accumulation = weights.sum(dim=-1, keepdim=True)
     rgb = (weights[..., None] * color).sum(dim=-2)
@@ -241,5 +241,5 @@ def render_frozen_coarse(
     background: Optional[Float[Tensor, "3"]],
 ) -> PackedRender:
     """Renders the coarse field at the same frozen samples."""
-    color = field.color(frozen.feature, directions[frozen.samples.ray_indices]).float()
+    color = field.color(frozen.feature, directions[frozen.samples.ray_indices])
     return render_packed(frozen.samples, frozen.num_rays, frozen.density, color, background)

@@ -9,16 +9,20 @@ from torch import Tensor
 
 from sparsestyle_ns.losses.content import content_loss
 from sparsestyle_ns.losses.nnfm import StyleIndex, nnfm_loss
+from sparsestyle_ns.style.image import SMALLEST_SIDE
 from sparsestyle_ns.style.vgg import VGGFeatures
 
 
 def fit_side(image: Float[Tensor, "B C H W"], longer_side: int) -> Float[Tensor, "B C h w"]:
-    """An image enlarged or reduced (bilinear, antialiased) so that its longer side has this many pixels."""
+    """An image enlarged or reduced (bilinear, antialiased) so that its longer side has this many pixels.
+
+    The shorter side gets at least `SMALLEST_SIDE`.
+    """
     height, width = image.shape[-2:]
     scale = longer_side / max(height, width)
-    if scale == 1.0:
+    size = (max(SMALLEST_SIDE, round(height * scale)), max(SMALLEST_SIDE, round(width * scale)))
+    if size == (height, width):
         return image
-    size = (max(8, round(height * scale)), max(8, round(width * scale)))
     return F.interpolate(image, size=size, mode="bilinear", antialias=True, align_corners=False)
 
 

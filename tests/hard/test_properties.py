@@ -1,0 +1,593 @@
+"""What holds for every input of the public functions of rendering, encodings, losses and style, whatever its size.
+
+Every public function of those packages has a property here, or is named with the reason why not;
+`test_every_public_function_has_a_property` looks for those that were forgotten.
+"""
+
+import importlib
+import inspect
+import math
+import pkgutil
+
+import hypothesis.extra.numpy as arrays
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from nerfstudio.data.scene_box import SceneBox
+from PIL import Image
+from torch.nn.functional import normalize
+
+import sparsestyle_ns.field_components
+import sparsestyle_ns.losses
+import sparsestyle_ns.rendering
+import sparsestyle_ns.style
+from sparsestyle_ns import schedules
+from sparsestyle_ns.field_components import hash_grid, hash_grid_kernels, positional_encoding
+from sparsestyle_ns.fields.coarse import CoarseField
+from sparsestyle_ns.fields.residual import ResidualField
+from sparsestyle_ns.losses import content, geometry, nnfm, reconstruction
+from sparsestyle_ns.rendering import (
+    baked,
+    compositing,
+    density_grid,
+    frozen_view,
+    ndc,
+    precision,
+    sampling,
+    space,
+    volume,
+)
+from sparsestyle_ns.style import color, image, targets, vgg
+
+PACKAGES = [
+    sparsestyle_ns.rendering,
+    sparsestyle_ns.field_components,
+    sparsestyle_ns.losses,
+    sparsestyle_ns.style,
+]
+COVERED = set()
+ELSEWHERE = {
+    "sparsestyle_ns.field_components.hash_grid_triton": "needs CUDA or Triton's interpreter: test_hash_grid.py",
+    "sparsestyle_ns.rendering.baked_kernels.march_rays": "is what march_compiled calls",
+    "sparsestyle_ns.rendering.baked.march_compiled": "is what render_baked calls on a CPU",
+}
+"""Modules and functions without a property of their own, and why."""
+
+FLOATS = st.sampled_from([torch.float32, torch.float64])
+ALL_FLOATS = st.sampled_from([torch.float16, torch.bfloat16, torch.float32, torch.float64])
+COUNTS = st.integers(1, 9)
+SEEDS = st.integers(0, 2**31)
+
+
+def covers(*functions):
+    """Says which functions a property is of."""
+    COVERED.update(f"{function.__module__}.{function.__name__}" for function in functions)
+    return lambda test: test
+
+
+def public_functions():
+    for package in PACKAGES:
+        for module_info in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
+            if module_info.name in ELSEWHERE:
+                continue
+            module = importlib.import_module(module_info.name)
+            for name, value in vars(module).items():
+                function = getattr(value, "py_func", value)  # numba's dispatchers wrap theirs
+                if inspect.isfunction(function) and function.__module__ == module.__name__ and name[0] != "_":
+                    yield f"{module.__name__}.{name}"
+
+
+def test_every_public_function_has_a_property():
+    assert sorted(set(public_functions()) - COVERED - set(ELSEWHERE)) == []
+
+
+@st.composite
+def tensors(draw, shape, low=-30.0, high=30.0, signed=False, zeros=True, dtype=torch.float64):
+    """Numbers whose logarithm to base 10 is even between `low` and `high`; some are 0."""
+    generator = torch.Generator().manual_seed(draw(SEEDS))
+    values = 10 ** (low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64))
+    if zeros:
+        values *= torch.rand(shape, generator=generator) > draw(st.sampled_from([0.0, 0.3, 1.0]))
+    if signed:
+        values *= torch.randint(0, 2, values.shape, generator=generator) * 2 - 1
+    return values.to(dtype)
+
+
+@st.composite
+def unit_rays(draw):
+    """Origins of up to 1e3 and directions of length 1, some along the axes."""
+    count = draw(COUNTS)
+    origins = draw(tensors((count, 3), -3, 3, signed=True, dtype=torch.float32))
+    generator = torch.Generator().manual_seed(draw(SEEDS))
+    directions = torch.randn(count, 3, generator=generator)
+    directions = torch.where(torch.rand(count, 3, generator=generator) < 0.2, 0.0, directions)
+    directions[directions.abs().amax(dim=-1) == 0] = torch.tensor([0.0, 0.0, -1.0])
+    return origins, normalize(directions, dim=-1)
+
+
+@st.composite
+def spaces(draw):
+    """A space and the scale of its world."""
+    kind = draw(st.sampled_from(["ndc", "box", "contracted"]))
+    scale = 10 ** draw(st.floats(-4, 4))
+    aabb = torch.tensor([[-1.0, -0.7, -0.5], [0.8, 1.0, 0.6]])
+    nearest = scale * 10 ** draw(st.floats(0, 1))
+    metadata = {
+        "space": kind,
+        "ndc_focal_over_half_size": [1.5, 2.0],
+        "ndc_near": scale,
+        "ndc_depth_range": [nearest, nearest * 10 ** draw(st.sampled_from([0, 1e-7, 0.5, 4]))],
+    }
+    return space.make_space(SceneBox(aabb=aabb if kind == "ndc" else scale * aabb), metadata), scale
+
+
+def packed_indices(draw, samples):
+    """Ascending ray indices of packed samples, and the number of rays, some of which have none."""
+    counts = draw(st.lists(st.integers(0, samples), min_size=1, max_size=5))
+    return torch.arange(len(counts)).repeat_interleave(torch.tensor(counts)), len(counts)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# rendering
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@covers(compositing.optical_depth, compositing.dense_weights)
+@given(st.data(), COUNTS, st.integers(1, 200), ALL_FLOATS)
+def test_weights_are_shares_of_the_light(data, num_rays, samples, dtype):
+    density = data.draw(tensors((num_rays, samples), -30, 30, dtype=dtype)).requires_grad_()
+    interval = data.draw(tensors((num_rays, samples), -8, 1, dtype=dtype))
+    interval[data.draw(st.booleans()) * num_rays :, -1] = torch.inf
+    depth = compositing.optical_depth(density, interval)
+    weights = compositing.dense_weights(depth)
+    assert (depth >= 0).all() and (depth <= compositing.MAX_OPTICAL_DEPTH).all()
+    assert (weights >= 0).all() and weights.sum(dim=-1).max() <= 1 + 1e-6
+    assert weights.shape == density.shape and weights.dtype == torch.promote_types(dtype, torch.float32)
+    (gradient,) = torch.autograd.grad(weights.square().sum(), density)
+    assert gradient.isfinite().all()
+
+
+@covers(compositing.packed_transmittance, compositing.packed_weights, compositing.packed_sum)
+@given(st.data(), st.integers(0, 60), ALL_FLOATS)
+def test_packed_samples_are_the_dense_ones_of_each_ray(data, samples, dtype):
+    ray_indices, num_rays = packed_indices(data.draw, samples)
+    depth = data.draw(tensors((len(ray_indices),), -30, 1.9, dtype=dtype)).requires_grad_()
+    light = compositing.packed_transmittance(depth, ray_indices, num_rays)
+    weights = compositing.packed_weights(depth, ray_indices, num_rays)
+    counts = torch.bincount(ray_indices, minlength=num_rays).tolist()
+    expected = torch.cat([compositing.dense_weights(ray) for ray in depth.split(counts)])
+    torch.testing.assert_close(weights, expected, rtol=1e-4, atol=1e-7)
+    assert (light >= 0).all() and (light <= 1 + 1e-6).all()
+    sums = compositing.packed_sum(weights[:, None], ray_indices, num_rays)
+    assert sums.shape == (num_rays, 1) and (sums <= 1 + 1e-6).all()
+    (gradient,) = torch.autograd.grad(sums.sum(), depth)
+    assert gradient.isfinite().all() and (gradient >= -1e-6).all()
+
+
+@covers(compositing.effective_samples, compositing.distortion)
+@given(st.data(), COUNTS, st.integers(1, 100), FLOATS)
+def test_the_spread_of_weights_is_a_number_in_its_range(data, num_rays, samples, dtype):
+    weights = data.draw(tensors((num_rays, samples), -35, 0, dtype=dtype))
+    weights = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1.0)
+    edges = data.draw(tensors((num_rays, samples + 1), -9, 0, dtype=dtype)).sort(dim=-1).values
+    weights.requires_grad_()
+    counted, spread = compositing.effective_samples(weights), compositing.distortion(weights, edges)
+    has_weight = weights.sum(dim=-1) > 0
+    assert (counted[~has_weight] == 0).all() and (counted[has_weight] >= 1 - 1e-4).all()
+    assert (counted <= samples * (1 + 1e-4)).all()
+    assert (spread >= 0).all() and (spread <= 1 + 1e-5).all()
+    for value in (counted, spread):
+        (gradient,) = torch.autograd.grad(value.sum(), weights)
+        assert gradient.isfinite().all() or value is counted
+
+
+@covers(sampling.even_edges, sampling.edges_from_histogram)
+@given(st.data(), COUNTS, st.integers(1, 300), st.integers(1, 300), st.booleans())
+def test_borders_ascend_from_0_to_1(data, num_rays, bins, samples, jitter):
+    generator = torch.Generator().manual_seed(data.draw(SEEDS)) if jitter else None
+    even = sampling.even_edges(num_rays, bins, torch.device("cpu"), generator)
+    masses = data.draw(tensors((num_rays, bins), -30, 30, dtype=torch.float32))
+    masses[:, data.draw(st.integers(0, bins - 1))] += 1e-20
+    for edges in (even, sampling.edges_from_histogram(even, masses, samples, generator)):
+        assert (edges.diff(dim=-1) >= 0).all()
+        assert (edges[:, 0] == 0).all() and (edges[:, -1] == 1).all()
+
+
+@covers(ndc.ndc_rays, ndc.ndc_points, ndc.ndc_distance)
+@given(st.data(), COUNTS, st.floats(1e-3, 1e3), FLOATS)
+def test_points_of_a_ray_have_their_images_on_the_rays_image(data, count, near, dtype):
+    origins = data.draw(tensors((count, 3), -3, 1, signed=True, dtype=dtype)) * near
+    directions = data.draw(tensors((count, 3), -2, 2, signed=True, dtype=dtype))
+    directions[:, 2] = -directions[:, 2].abs()
+    origins.requires_grad_()
+    start, extent, valid = ndc.ndc_rays(origins, directions, (1.5, 2.0), near)
+    t = data.draw(tensors((count, 1), -3, 0, dtype=dtype)).clamp(max=0.9)
+    distance = ndc.ndc_distance(t, origins, directions, near, max_distance=1e6 * near)
+    images = ndc.ndc_points(origins + distance * directions, (1.5, 2.0), near)
+    for values in (start, extent, distance, images):
+        assert values.isfinite().all()
+    (gradient,) = torch.autograd.grad(start.sum() + extent.sum() + distance.sum() + images.sum(), origins)
+    assert gradient.isfinite().all()
+    # Rounding of the largest coordinates of a point, seen from its depth.
+    plain = valid & (directions[:, 2:].abs() * 10 > directions.abs().amax(dim=-1, keepdim=True))
+    size = (
+        1
+        + images.detach().abs().amax(dim=-1, keepdim=True)
+        + (origins.detach().abs() / near).amax(dim=-1, keepdim=True)
+    )
+    assert ((images - start - t * extent).abs() <= 1e-3 * size)[plain.squeeze(-1)].all()
+
+
+@covers(space.spacing, space.inverse_spacing, space.contract)
+@given(st.data(), COUNTS, FLOATS)
+def test_contraction_and_spacing_stay_in_their_ranges(data, count, dtype):
+    points = data.draw(tensors((count, 3), -37, 38, signed=True, dtype=dtype)).requires_grad_()
+    bent = space.contract(points)
+    (gradient,) = torch.autograd.grad(bent.sum(), points)
+    assert bent.abs().max() <= 1 and gradient.isfinite().all()
+    distances = points.detach().abs().flatten()
+    spaced = space.spacing(distances)
+    assert (spaced >= 0).all() and (spaced <= 1).all()
+    near = distances < 100
+    torch.testing.assert_close(space.inverse_spacing(spaced)[near], distances[near], rtol=1e-4, atol=0)
+    assert space.inverse_spacing(spaced).max() <= space.MAX_DISTANCE * (1 + 1e-6)
+
+
+@covers(space.intersect_box, space.make_space, density_grid.interval_lengths)
+@given(st.data(), spaces(), unit_rays(), st.integers(1, 64))
+def test_segments_are_numbers_in_any_space(data, scene, rays, samples):
+    layout, scale = scene
+    origins, directions = scale * rays[0], rays[1]
+    segments = layout.segments(origins, directions)
+    edges = sampling.even_edges(len(origins), samples, origins.device, torch.Generator().manual_seed(data.draw(SEEDS)))
+    positions = segments.positions(edges)
+    lengths = density_grid.interval_lengths(segments, edges, layout.unbounded)
+    distance = segments.distance(edges[:, :1])
+    assert positions.isfinite().all() and distance.isfinite().all()
+    assert (lengths >= 0).all() and (lengths[~segments.hit] == 0).all()
+    assert lengths[:, :-1].isfinite().all() and (lengths[:, -1].isinf() <= segments.hit).all()
+    entry, leave, hit = space.intersect_box(origins, directions, -torch.ones(3), torch.ones(3), near=0.1)
+    assert (leave >= entry).all() and (entry >= 0.1).all() and leave.isfinite().all()
+    assert torch.equal(hit[:, None], leave > entry)
+
+
+@covers(density_grid.grid_cells, density_grid.march)
+@given(spaces(), unit_rays(), st.integers(1, 9), st.integers(1, 40))
+def test_samples_lie_in_occupied_cells(scene, rays, resolution, steps):
+    layout, scale = scene
+    origins, directions = scale * rays[0], rays[1]
+    segments = layout.segments(origins, directions)
+    occupancy = density_grid.Occupancy(resolution)
+    occupancy.occupied.copy_(
+        torch.rand(resolution, resolution, resolution, generator=torch.Generator().manual_seed(0)) < 0.5
+    )
+    samples = density_grid.march(segments, occupancy, steps, layout.unbounded)
+    cells = density_grid.grid_cells(samples.positions, resolution)
+    assert (cells >= 0).all() and (cells < resolution).all()
+    assert (samples.ray_indices.diff() >= 0).all() and segments.hit[samples.ray_indices].all()
+    in_cells = occupancy.contains(samples.positions)
+    assert (in_cells | samples.lengths.isinf()).all()
+    assert (samples.lengths >= 0).all() and samples.positions.isfinite().all()
+
+
+@covers(volume.over_background, volume.mean_position, volume.composite)
+@given(st.data(), COUNTS, st.integers(1, 50))
+def test_pixels_of_weights_are_mixtures(data, num_rays, samples):
+    depth = data.draw(tensors((num_rays, samples), -30, 2, dtype=torch.float32)).clamp(max=80)
+    weights = compositing.dense_weights(depth)
+    s = torch.linspace(0, 1, samples).expand(num_rays, -1)
+    accumulation = weights.sum(dim=-1, keepdim=True)
+    background = torch.rand(3, generator=torch.Generator().manual_seed(data.draw(SEEDS)))
+    pixel = volume.over_background(accumulation * 0.5, accumulation, background)
+    assert (pixel >= -1e-6).all() and (pixel <= 1 + 1e-6).all()
+    mean = volume.mean_position(weights, s)
+    assert (mean >= 0).all() and (mean <= 1 + 1e-5).all()
+    sums = torch.cat([accumulation.expand(-1, 3) * 0.5, accumulation, (weights * s).sum(dim=-1, keepdim=True)], dim=-1)
+    render = volume.composite(sums, background)
+    torch.testing.assert_close(render.rgb, pixel)
+    torch.testing.assert_close(render.s, mean, rtol=1e-5, atol=1e-5)
+
+
+def tiny_fields(seed, bias):
+    torch.manual_seed(seed)
+    field = CoarseField(num_layers=1, layer_width=8, feature_dim=4, direction_levels=2, density_bias=bias)
+    grid = hash_grid.HashGrid(2, 4, 8, 2, 6, init_scale=1.0)
+    return field, ResidualField(grid, 4, 1, 8, density_scale=10.0)
+
+
+@covers(
+    volume.render_coarse,
+    volume.freeze_samples,
+    volume.visible_samples,
+    volume.evaluate_front_to_back,
+    volume.accumulation_of,
+    volume.render_packed,
+    volume.render_stylised,
+    volume.render_frozen_coarse,
+    precision.autocast,
+    precision.multiplies_bfloat16,
+)
+@given(
+    SEEDS,
+    spaces(),
+    unit_rays(),
+    st.integers(1, 30),
+    st.floats(-50, 1e9),
+    st.sampled_from(["float32", "bfloat16", "auto"]),
+)
+def test_renders_of_any_field_are_pictures(seed, scene, rays, steps, bias, number_format):
+    layout, scale = scene
+    origins, directions = scale * rays[0], rays[1]
+    field, residual = tiny_fields(seed, bias)
+    segments = layout.segments(origins, directions)
+    background = torch.rand(3)
+    assert precision.multiplies_bfloat16(origins.device) in (True, False)
+    with precision.autocast(origins.device, number_format):
+        edges = sampling.even_edges(len(origins), steps, origins.device)
+        coarse = volume.render_coarse(field, segments, directions, edges, layout.unbounded, background)
+        frozen = volume.freeze_samples(
+            field, residual, density_grid.Occupancy(2), segments, steps, layout.unbounded, min_transmittance=1e-3
+        )
+        stylised = volume.render_stylised(residual, frozen, background)
+        again = volume.render_frozen_coarse(field, frozen, directions, background)
+    (coarse.rgb.square().sum() + stylised.rgb.square().sum()).backward()
+    for render in (coarse, stylised, again):
+        assert (render.rgb >= -1e-6).all() and (render.rgb <= 1 + 1e-5).all()
+        assert (render.accumulation <= 1 + 1e-6).all() and (render.s >= 0).all() and (render.s <= 1 + 1e-5).all()
+    torch.testing.assert_close(volume.accumulation_of(frozen), again.accumulation)
+    # What lies behind 1e-3 of the light is left out; bfloat16 rounds logits at the samples of one render alone.
+    if number_format == "float32":
+        torch.testing.assert_close(again.rgb, coarse.rgb, rtol=0, atol=2e-3)
+    for parameter in [*field.parameters(), *residual.parameters()]:
+        assert parameter.grad is None or parameter.grad.isfinite().all()
+
+
+@covers(baked.encode, baked.decode)
+@given(st.data(), COUNTS)
+def test_codes_keep_densities_to_a_step_and_colours_to_half_a_byte(data, count):
+    values = torch.cat([data.draw(tensors((count, 2), -30, 30)), torch.rand(count, 6).double()], dim=-1).float()
+    decoded = baked.decode(baked.encode(values).float())
+    density, found = values[:, :2].clamp(max=baked.MAX_DENSITY), decoded[:, :2]
+    assert torch.equal(found > 0, density > 0)
+    step = math.expm1(baked.DENSITY_STEP)
+    assert ((found - density).abs() <= step * (density + baked.DENSITY_UNIT)).all()
+    assert (decoded[:, 2:] - values[:, 2:]).abs().max() <= 0.5 / 255 + 1e-6
+
+
+@covers(baked.render_baked, baked.march_in_torch)
+@given(SEEDS, spaces(), unit_rays(), st.integers(1, 12), st.integers(1, 9))
+def test_baked_renders_are_pictures(seed, scene, rays, steps, resolution):
+    layout, scale = scene
+    segments = layout.segments(scale * rays[0], rays[1])
+    generator = torch.Generator().manual_seed(seed)
+    logs = torch.randn(2, generator=generator)
+
+    def shade(points):
+        density = torch.exp(3 * logs + (4 * points).sin().sum(dim=-1, keepdim=True))
+        return torch.cat([density, (points.repeat(1, 2) + 1) / 2], dim=-1)
+
+    batch = baked.Rays(segments, density_grid.Occupancy(2), steps, layout.unbounded, 1e-3)
+    device = torch.device("cpu")
+    compiled = baked.render_baked(baked.BakedVolume(shade, resolution, device), batch, torch.ones(3))
+    plain = baked.march_in_torch(baked.BakedVolume(shade, resolution, device), batch, torch.ones(3))
+    for left, right in zip(compiled, plain, strict=True):
+        assert (left.rgb >= -1e-6).all() and (left.rgb <= 1 + 1e-5).all()
+        # A sample within rounding of a cell's border, or of 1e-3 of the light, may count in one of them alone.
+        torch.testing.assert_close(left.accumulation, right.accumulation, rtol=0, atol=2e-3)
+
+
+@covers(frozen_view.split_by_samples)
+@given(st.lists(st.integers(0, 1000), max_size=50), st.integers(1, 2000))
+def test_runs_of_rays_are_all_rays_in_order(counts, limit):
+    runs = frozen_view.split_by_samples(torch.tensor(counts, dtype=torch.long), limit)
+    rays = [ray for run in runs for ray in range(run.start, run.stop)]
+    assert rays == list(range(len(counts)))
+    assert all(sum(counts[run]) <= limit or run.stop - run.start == 1 for run in runs)
+
+
+@covers(precision.at_least_float32, precision.without_autocast)
+@given(ALL_FLOATS, COUNTS)
+def test_full_precision_survives_autocast(dtype, count):
+    values = torch.rand(count, count).to(dtype)
+    full = precision.at_least_float32(values)
+    assert full.dtype == torch.promote_types(dtype, torch.float32) and torch.equal(full.to(dtype), values)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert precision.without_autocast(torch.matmul)(full, full).dtype == full.dtype
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# encodings
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@covers(positional_encoding.positional_encoding, positional_encoding.revealed_levels)
+@given(st.data(), COUNTS, st.integers(0, 12), ALL_FLOATS, st.floats(-1, 2))
+def test_octaves_are_float64s_sines_and_cosines(data, count, levels, dtype, fraction):
+    x = data.draw(tensors((count, 2), -30, 4, signed=True, dtype=dtype))
+    encoded = positional_encoding.positional_encoding(x, levels)
+    octaves = 2.0 ** torch.arange(levels, dtype=torch.float64)
+    angles = x.double()[:, None] * octaves[:, None]
+    expected = torch.cat([x.double(), torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(1)], dim=-1)
+    torch.testing.assert_close(encoded.double(), expected, rtol=0, atol=1e-6)
+    revealed = positional_encoding.revealed_levels(fraction, levels)
+    assert (revealed >= 0).all() and (revealed <= 1).all() and (revealed.diff() <= 0).all()
+    weighted = positional_encoding.positional_encoding(x, levels, revealed)
+    assert (weighted.abs() <= encoded.abs()).all()
+
+
+@covers(hash_grid.grid_resolutions)
+@given(st.integers(1, 40), st.integers(1, 2**22), st.integers(1, 2**22))
+def test_levels_grow_from_the_coarsest_to_the_finest(levels, first, second):
+    lowest, highest = min(first, second), max(first, second)
+    resolutions = hash_grid.grid_resolutions(levels, lowest, highest)
+    assert len(resolutions) == levels and sorted(resolutions) == list(resolutions)
+    assert resolutions[0] == lowest and (levels == 1 or resolutions[-1] == highest)
+
+
+@covers(
+    hash_grid.hash_corners,
+    hash_grid.locate_corners,
+    hash_grid.interpolate,
+    hash_grid.fused_kernels,
+    hash_grid_kernels.gather,
+    hash_grid_kernels.scatter,
+)
+@given(st.data(), st.integers(0, 20), st.integers(1, 4), st.integers(1, 2**16), st.integers(0, 10), FLOATS)
+def test_both_hash_grids_agree_and_stay_in_the_table(data, count, levels, highest, log2_size, dtype):
+    features = data.draw(st.sampled_from([1, 4]))  # kernels are compiled for each length of a row
+    resolutions = hash_grid.grid_resolutions(levels, 1, highest)
+    size = 2**log2_size
+    positions = data.draw(tensors((count, 3), -8, 0, dtype=dtype))
+    table = data.draw(tensors((levels * size, features), -4, 4, signed=True, dtype=dtype)).requires_grad_()
+    corners = hash_grid.locate_corners(positions, resolutions, size)
+    assert (corners.rows >= 0).all() and (corners.rows < levels * size).all()
+    torch.testing.assert_close(corners.weights.sum(dim=-1), torch.ones(count, levels, dtype=dtype))
+    integers = (positions * highest).long()
+    rows = hash_grid.hash_corners(integers, size)
+    assert (rows >= 0).all() and (rows < size).all()
+    encoded = hash_grid.interpolate(table, corners)
+    kernels = hash_grid.fused_kernels(positions.device)
+    by_level = table.detach().view(levels, size, features)
+    gathered = kernels.gather(by_level, positions, resolutions)
+    largest = table.detach().abs().max().item()
+    tolerance = largest * (1e-5 if dtype == torch.float32 else 1e-12) + 1e-30
+    torch.testing.assert_close(gathered, encoded.detach(), rtol=0, atol=tolerance)
+    grad = torch.ones_like(encoded)
+    (expected,) = torch.autograd.grad(encoded, table, grad)
+    scattered = kernels.scatter(grad, positions, resolutions, by_level.shape)
+    torch.testing.assert_close(scattered.view(table.shape), expected, rtol=1e-4, atol=1e-5)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# losses
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@covers(nnfm.nearest_neighbors, nnfm.nnfm_loss)
+@given(st.data(), st.integers(1, 40), st.integers(1, 60), st.integers(1, 8), ALL_FLOATS, st.integers(1, 70))
+def test_neighbours_are_the_most_similar(data, count, style_count, channels, dtype, chunk_size):
+    largest = 4 if dtype == torch.float16 else 15
+    features = data.draw(tensors((count, channels), -3, largest, signed=True, dtype=dtype)).requires_grad_()
+    style = data.draw(tensors((style_count, channels), -3, largest, signed=True, dtype=dtype))
+    index = nnfm.StyleIndex(style, block_size=data.draw(COUNTS))
+    directions = normalize(style.double(), dim=-1)
+    similarities = normalize(features.detach().double(), dim=-1) @ directions.T
+    for found in (nnfm.nearest_neighbors(features, style, chunk_size), index.nearest(features)):
+        chosen = similarities.gather(1, found[:, None]).squeeze(1)
+        assert (chosen >= similarities.amax(dim=1) - 1e-5).all()
+    for target in (style, index):
+        loss = nnfm.nnfm_loss(features, target)
+        (gradient,) = torch.autograd.grad(loss, features)
+        assert 0 <= loss <= 2 and gradient.isfinite().all()
+        assert loss.item() == pytest.approx((1 - similarities.amax(dim=1)).mean().item(), abs=1e-5)
+
+
+@covers(content.content_loss, reconstruction.reconstruction_loss)
+@given(st.data(), st.integers(1, 50), st.floats(-30, 30), FLOATS)
+def test_squared_errors_are_relative_and_finite(data, count, size, dtype):
+    features = data.draw(tensors((count, 3), -3, 3, dtype=dtype)).requires_grad_()
+    target = data.draw(tensors((count, 3), -3, 3, dtype=dtype, zeros=False))
+    scale = 10.0**size
+    loss = content.content_loss(scale * features, scale * target)
+    expected = (features - target).double().square().mean() / target.double().square().mean()
+    torch.testing.assert_close(loss.double(), expected, rtol=1e-4, atol=1e-10)
+    photo = target / target.max()
+    error = reconstruction.reconstruction_loss(features, photo)
+    assert error >= 0 and reconstruction.reconstruction_loss(photo, photo) == 0
+    for value in (loss, error):
+        (gradient,) = torch.autograd.grad(value, features, retain_graph=True)
+        assert gradient.isfinite().all()
+
+
+@covers(geometry.near_density)
+@given(st.data(), COUNTS, st.integers(1, 40), st.floats(0.001, 1))
+def test_near_density_is_at_most_the_mean_density(data, num_rays, samples, reach):
+    density = data.draw(tensors((num_rays, samples), -30, 6.5, dtype=torch.float32))
+    edges = sampling.even_edges(num_rays, samples, torch.device("cpu"))
+    near = geometry.near_density(density, edges, reach)
+    assert 0 <= near <= density.mean() * (1 + 1e-5)
+    assert geometry.near_density(density, edges, 1.0) == pytest.approx(density.mean().item(), rel=1e-5)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# style
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@covers(color.color_moments, color.palette_transform, color.apply_palette)
+@given(st.data(), st.integers(1, 60), st.integers(1, 60), FLOATS)
+def test_transferred_colours_have_the_styles_mean(data, count, style_count, dtype):
+    colors = data.draw(tensors((count, 3), -12, 0, dtype=dtype))
+    style = data.draw(tensors((style_count, 3), -12, 0, dtype=dtype))
+    weights = data.draw(tensors((count,), -12, 0))
+    assume(weights.sum() > 0)
+    mean, covariance = color.color_moments(colors, weights)
+    assert torch.linalg.eigvalsh(covariance).min() >= -1e-15
+    matrix, offset = color.palette_transform(mean, covariance, *color.color_moments(style))
+    transferred = color.apply_palette(colors, matrix, offset)
+    style_mean, _ = color.color_moments(style)
+    torch.testing.assert_close(color.color_moments(transferred, weights)[0], style_mean, rtol=0, atol=1e-3)
+    cut = color.apply_palette(colors, matrix, offset, clamp=True)
+    assert (cut >= 0).all() and (cut <= 1).all()
+
+
+@covers(image.load_style_image)
+@given(
+    arrays.arrays(
+        st.sampled_from([np.uint8, np.uint16]),
+        st.tuples(st.integers(8, 20), st.integers(8, 20)),
+        elements=st.integers(0, 255),
+    ),
+    st.sampled_from([None, 8, 15, 64]),
+)
+def test_pictures_are_read_as_they_were_written(tmp_path_factory, pixels, max_side):
+    path = tmp_path_factory.mktemp("pictures") / "picture.png"
+    Image.fromarray(pixels).save(path)
+    largest = np.iinfo(pixels.dtype).max
+    assume(max_side is None or min(pixels.shape) * max_side >= 8 * max(pixels.shape))
+    read = image.load_style_image(path, max_side)
+    assert read.dtype == torch.float32 and read.min() >= 0 and read.max() <= 1
+    if max_side is None:
+        expected = torch.from_numpy(pixels.astype(np.float32) / largest)
+        torch.testing.assert_close(read, expected.expand(3, -1, -1))
+    else:
+        assert max(read.shape) <= max(3, max_side)
+
+
+@pytest.fixture(scope="module")
+def backbone():
+    return vgg.load_backbone("vgg16-shift-tolerant")
+
+
+@covers(vgg.load_backbone, targets.fit_side, targets.feature_rows)
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(8, 24), st.floats(0, 1), SEEDS)
+def test_pictures_of_any_shape_have_features(backbone, height, width, side, contrast, seed):
+    picture = contrast * torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(seed))
+    picture.requires_grad_()
+    fitted = targets.fit_side(picture, side)
+    assert max(fitted.shape[-2:]) == side and min(fitted.shape[-2:]) >= 8
+    rows = targets.feature_rows(backbone(fitted))
+    assert rows.shape[1] == vgg.FEATURE_CHANNELS and (rows >= 0).all() and rows.isfinite().all()
+    (gradient,) = torch.autograd.grad(rows.square().mean(), picture)
+    assert gradient.isfinite().all()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# schedules
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 10**12), st.floats(0, 1e6), st.floats(0, 1), st.integers(0, 10**9))
+def test_content_weights_fall_from_the_first_to_the_last(step, initial, decay, duration):
+    weight = schedules.content_weight(step, initial, decay, duration)
+    assert initial * decay * (1 - 1e-12) <= weight <= initial
+    assert schedules.content_weight(step + 1, initial, decay, duration) <= weight
+
+
+@given(st.floats(0, 1), st.floats(0, 1), st.floats(0, 1))
+def test_ramps_are_shares(progress, start, length):
+    share = schedules.ramp(progress, start, length)
+    assert 0 <= share <= 1
+    assert schedules.ramp(min(1.0, progress + 0.1), start, length) >= share
