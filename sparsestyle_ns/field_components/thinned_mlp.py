@@ -33,7 +33,9 @@ def thin(
     gradients: Float[Tensor, "points channels"], thinning: Thinning
 ) -> Tuple[Int[Tensor, " kept"], Float[Tensor, "kept channels"]]:
     """The points that stay, ascending, and their gradients over the probabilities with which they do."""
-    sizes = gradients.norm(dim=-1)
+    # In units of the largest number no square overflows, and none underflows that matters.
+    largest = torch.linalg.vector_norm(gradients, ord=torch.inf) if gradients.numel() else gradients.new_ones(())
+    sizes = torch.linalg.vector_norm(gradients / torch.where(largest > 0, largest, 1.0), dim=-1)
     limit = thinning.threshold * sizes.mean()
     # Gradients that are all 0, or not numbers, stay as they are.
     chance = torch.where(sizes < limit, sizes / limit, 1.0)

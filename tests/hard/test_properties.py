@@ -24,7 +24,7 @@ import sparsestyle_ns.losses
 import sparsestyle_ns.rendering
 import sparsestyle_ns.style
 from sparsestyle_ns import schedules
-from sparsestyle_ns.field_components import hash_grid, hash_grid_kernels, positional_encoding
+from sparsestyle_ns.field_components import hash_grid, hash_grid_kernels, positional_encoding, thinned_mlp
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.losses import content, geometry, nnfm, reconstruction
@@ -415,6 +415,28 @@ def test_octaves_are_float64s_sines_and_cosines(data, count, levels, dtype, frac
     assert (revealed >= 0).all() and (revealed <= 1).all() and (revealed.diff() <= 0).all()
     weighted = positional_encoding.positional_encoding(x, levels, revealed)
     assert (weighted.abs() <= encoded.abs()).all()
+
+
+@covers(thinned_mlp.thin, thinned_mlp.thinned_mlp)
+@given(st.data(), st.integers(0, 30), st.floats(0.01, 100.0), FLOATS, SEEDS)
+def test_a_thinned_backward_pass_weights_points_up_and_stays_finite(data, count, threshold, dtype, seed):
+    gradients = data.draw(tensors((count, 3), -30, 30, signed=True, dtype=dtype))
+    thinning = thinned_mlp.Thinning(threshold, torch.Generator().manual_seed(seed))
+    kept, weighted = thinned_mlp.thin(gradients, thinning)
+    assert (kept.diff() > 0).all() and torch.isfinite(weighted).all()
+    before, after = gradients[kept].double(), weighted.double()
+    assert (after.abs() >= before.abs() * (1 - 1e-5)).all() and (after * before >= 0).all()
+    # None counts for more than the limit, or than it did where it was above that.
+    limit = threshold * gradients.double().norm(dim=-1).mean()
+    assert (after.norm(dim=-1) <= torch.maximum(before.norm(dim=-1), limit) * (1 + 1e-5)).all()
+
+    torch.manual_seed(seed)
+    layer, head = torch.nn.Linear(4, 5, dtype=dtype), torch.nn.Linear(5, 3, dtype=dtype)
+    inputs = data.draw(tensors((count, 4), -3, 3, signed=True, dtype=dtype))
+    (output,) = thinned_mlp.thinned_mlp(inputs, [layer], [head], thinning)
+    torch.testing.assert_close(output, head(torch.relu(layer(inputs))))
+    (output.clamp(-1e3, 1e3).sum() * 1e-3).backward()
+    assert all(torch.isfinite(parameter.grad).all() for parameter in (*layer.parameters(), *head.parameters()))
 
 
 @covers(hash_grid.grid_resolutions)
