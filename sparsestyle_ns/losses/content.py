@@ -1,6 +1,7 @@
 """The content loss: how far the features of a rendered view have moved from those of its photograph."""
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -36,7 +37,8 @@ def content_loss(features: Float[Tensor, "*shape"], target: Float[Tensor, "*shap
         raise ValueError(f"features are {tuple(features.shape)} and the target {tuple(target.shape)}: they must agree")
     features, target = at_least_float32(features), at_least_float32(target.detach())
     # In units of the largest number of the target no square of it overflows, and none underflows that matters.
-    largest = torch.linalg.vector_norm(target, ord=torch.inf)
+    largest = target.abs().amax()
     unit = torch.where(largest > 0, largest, 1.0)
-    size = torch.where(largest > 0, (target / unit).square().mean(), 1.0)
-    return ((features - target) / unit).square().mean() / size
+    scaled = target / unit
+    size = torch.where(largest > 0, scaled.square().mean(), 1.0)
+    return F.mse_loss(features / unit, scaled) / size

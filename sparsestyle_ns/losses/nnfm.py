@@ -193,8 +193,9 @@ def nnfm_loss(
     is constant almost everywhere, and the style gets no gradient.
 
     Args:
-        features: what the rendered view gives, one vector a pixel of its feature map. A vector of length zero has
-            no direction: it counts as cosine 0 and gets a gradient of zero.
+        features: what the rendered view gives, one vector a pixel of its feature map, of lengths up to 1e18. A vector
+            of length zero, or no more than `SHORTEST`, has no direction: it counts as cosine 0 and gets a gradient of
+            zero.
         style_features: what the style image gives, one vector a row, or the index of it: make one where the same
             style is used more than once or twice.
         neighbors: the rows of `style_features` that `nearest_neighbors` gave, where they are known; searched otherwise.

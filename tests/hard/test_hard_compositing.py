@@ -226,6 +226,20 @@ def test_gradients_are_those_of_float64():
 
 @hard_case(
     "compositing",
+    case="a sample of optical depth 10 to 75",
+    could_go_wrong="1 − exp(−τ) has the gradient 1 − (1 − exp(−τ)): no digit of it is left at 16, nothing at 17",
+    must_hold="the gradient is exp(−τ) to five digits, so that a wall can open again",
+)
+@pytest.mark.parametrize("depth", [10.0, 16.0, 17.0, 30.0, 75.0])
+def test_the_gradient_of_a_wall_is_not_0(depth):
+    density = torch.tensor([[depth, 1.0]], requires_grad=True)
+    for weights in both_layouts(density, torch.ones(1, 2)):
+        (gradient,) = torch.autograd.grad(weights[0, 0], density)
+        assert gradient[0, 0].item() == pytest.approx(math.exp(-depth), rel=1e-5)
+
+
+@hard_case(
+    "compositing",
     case="rays of any density and thousands of samples",
     could_go_wrong="weights add up to more than 1, and pixels get brighter than their brightest sample",
     must_hold="the sum is never above 1 + 1e-6, no weight below 0",
