@@ -11,6 +11,7 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "data_scripts")]
+pytest_plugins = ["hard.table"]
 
 TINY = [
     *("--pipeline.datamanager.train-num-rays-per-batch", "128"),
