@@ -154,7 +154,8 @@ def read_scene(parser: DataParser, split: str = "train", **kwargs: Any) -> Datap
     config = parser.config
     name = type(config).__name__.removesuffix("DataParserConfig").lower()
     if isinstance(config, BlenderDataParserConfig):
-        check_transforms(config.data / f"transforms_{split}.json", with_angle=True)
+        frames = check_transforms(config.data / f"transforms_{split}.json", with_angle=True)
+        open_photo(config.data / f"{frames[0].replace('./', '')}.png")  # gives all cameras of the split their size
     elif isinstance(config, NerfstudioDataParserConfig):
         is_file = config.data.suffix == ".json"
         check_transforms(config.data if is_file else config.data / "transforms.json", with_angle=False)
@@ -179,6 +180,8 @@ def check_cameras(outputs: DataparserOutputs) -> None:
         InputError: one isn't or hasn't; its photo is named.
     """
     cameras = outputs.cameras
+    if len(cameras) == 0:  # a split may be empty
+        return
     numbers = [cameras.camera_to_worlds.flatten(1), cameras.fx, cameras.fy, cameras.cx, cameras.cy]
     usable = torch.cat([part.reshape(len(cameras), -1) for part in numbers], dim=-1).isfinite().all(dim=-1)
     for part in (cameras.fx, cameras.fy, cameras.width, cameras.height):

@@ -11,7 +11,6 @@ convention of RegNeRF and FreeNeRF).
 """
 
 import math
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import List, NamedTuple, Optional, Tuple, Type
@@ -210,7 +209,7 @@ def _other_parser_hint(folder: Path) -> str:
 def _load_rows(path: Path) -> Float[Tensor, "num_views 17"]:
     try:
         rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except Exception as error:  # numpy meets a damaged header with errors of its parser's and tokeniser's too
         raise InputError(
             f"{path} cannot be read as an array of numbers ({type(error).__name__}), it may be cut short or be "
             "something else under that name: fetch or make it again."

@@ -3,15 +3,15 @@
 import json
 import math
 from pathlib import Path
-from typing import Any, Dict
+from typing import Any, Dict, List
 
 import numpy as np
 
 from sparsestyle_ns.errors import InputError
 
 
-def check_transforms(path: Path, with_angle: bool) -> None:
-    """Makes sure that every frame of a `transforms….json` names a photo and has a camera pose.
+def check_transforms(path: Path, with_angle: bool) -> List[str]:
+    """Makes sure that every frame of a `transforms….json` names a photo and has a camera pose; returns the names.
 
     Args:
         path: the file.
@@ -38,6 +38,7 @@ def check_transforms(path: Path, with_angle: bool) -> None:
                 "pose, which is a 4x4 matrix of finite numbers with three independent directions: correct it or drop "
                 "the frame."
             )
+    return [frame["file_path"] for frame in frames]
 
 
 def _read(path: Path) -> Dict[str, Any]:
