@@ -44,12 +44,9 @@ def assert_same_within(found: Dict[str, torch.Tensor], expected: Dict[str, torch
     must_hold="the weights of one process with the same settings, to 0.1% of what 6 steps have moved them",
 )
 def test_stage_1_on_two_processes_is_stage_1_on_one(llff_scene, tmp_path):
-    for name, flags in (
-        ("one", []),
-        ("two", TWO),
-        ("start", ["--max-num-iterations", "1", "--optimizers.fields.optimizer.lr", "1e-12"]),
-    ):
-        ns_train("coarse-fewshot", llff_scene, tmp_path / name, *TINY, *COMMON, *flags)
+    still = ["--max-num-iterations", "1", "--optimizers.fields.optimizer.lr", "1e-12"]
+    for name, more in (("one", []), ("two", TWO), ("start", still)):
+        ns_train("coarse-fewshot", llff_scene, tmp_path / name, *TINY, *COMMON, *more)
     one, two, start = (weights(tmp_path / name, "coarse-fewshot") for name in ("one", "two", "start"))
     assert_same_within(two, one, start, share=1e-3)
 

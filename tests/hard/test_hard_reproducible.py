@@ -146,7 +146,7 @@ def test_a_run_killed_at_odd_moments_ends_as_one_that_was_left_alone(command, tm
 @hard_case(
     "reproducible",
     case="what a kill leaves behind, and other files, beside the checkpoints",
-    could_go_wrong="nerfstudio's reader takes every file in the folder for a checkpoint, and fails on a name or loads it",
+    could_go_wrong="nerfstudio takes every file in the folder for a checkpoint, and fails on its name or loads it",
     must_hold="the newest whole checkpoint is found",
 )
 def test_other_files_are_never_taken_for_a_checkpoint(command, runs, tmp_path):
