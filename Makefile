@@ -46,6 +46,8 @@ bench: $(READY)
 	set -e; for name in hash_grid nnfm stage2_step render memory scaling stage1; do \
 	    $(BIN)/python -m benchmarks.$$name $(BENCH); \
 	done
+	$(BIN)/python -m benchmarks.stability --method coarse-fewshot-draft $(BENCH)
+	$(BIN)/python -m benchmarks.stability --method hier-style-draft $(BENCH)
 	$(BIN)/python -m benchmarks.summary $(BENCH)
 
 $(READY): pyproject.toml constraints.txt | $(BIN)/python
