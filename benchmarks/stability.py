@@ -1,6 +1,6 @@
 """The largest learning rate at which a method still trains: its default, doubled until training fails.
 
-A rate is stable where no step has to be skipped for a gradient that isn't finite, and the loss ends no more than half as
+A rate is stable where no step has to be skipped for a gradient that isn't finite, and the loss ends at most half as
 high again as at the default. The rate stays the same all along, without the method's schedule.
 """
 

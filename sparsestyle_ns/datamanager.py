@@ -21,6 +21,7 @@ from torch import Tensor
 from sparsestyle_ns.dataparsers.transforms import check_transforms
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.photos import PhotoDataset, check_one_size, open_photo
+from sparsestyle_ns.processes import num_processes
 from sparsestyle_ns.view_selection import BLENDER_VIEWS, DEFAULT_NUM_VIEWS, select_views
 
 
@@ -141,8 +142,8 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         return bundle_rays(self.pixels, rows), {"image": self.pixels.colors[rows]}
 
     def get_train_rays_per_batch(self) -> int:
-        """Rays in a batch of `next_train`."""
-        return self.config.train_num_rays_per_batch
+        """Rays of a batch that this process renders."""
+        return self.config.train_num_rays_per_batch // num_processes()
 
 
 def read_scene(parser: DataParser, split: str = "train", **kwargs: Any) -> DataparserOutputs:
