@@ -101,29 +101,31 @@ def any_process(condition: bool, device: torch.device) -> bool:
     return bool(flag)
 
 
-def prepare_launch(device_type: str) -> None:
-    """Makes `ns-train`, where this process is one that is about to start several, do so as it should.
+def prepare_launch() -> None:
+    """Makes `ns-train`, where this process is one, start several processes as it should.
 
     nerfstudio 1.1.5 asserts in each new process that there is CUDA, also where it is to run on the CPU; shows a
     traceback where a process has ended with a sentence; and kills its processes on Ctrl-C before they can save.
     """
     script = sys.modules.get("nerfstudio.scripts.train")
-    if script is None or getattr(script.launch, "__module__", "") == __name__:
+    if script is None or script.launch.__module__ == __name__:
         return
-    nerfstudio_launch = script.launch
+    nerfstudio_launch, nerfstudio_worker = script.launch, script._distributed_worker
 
-    def launch(*args: Any, **kwargs: Any) -> None:
+    def launch(**settings: Any) -> None:
+        if settings["num_devices_per_machine"] * settings["num_machines"] == 1:
+            return nerfstudio_launch(**settings)
         former = signal.signal(signal.SIGINT, signal.SIG_IGN)  # each process handles Ctrl-C itself
+        script._distributed_worker = _work_on_cpu if settings["device_type"] == "cpu" else nerfstudio_worker
         try:
-            nerfstudio_launch(*args, **kwargs)
+            nerfstudio_launch(**settings)
         except ProcessExitedException as error:
             raise SystemExit(error.exit_code) from None
         finally:
+            script._distributed_worker = nerfstudio_worker
             signal.signal(signal.SIGINT, former)
 
     script.launch = launch
-    if device_type == "cpu":
-        script._distributed_worker = _work_on_cpu
 
 
 def _work_on_cpu(

@@ -65,7 +65,7 @@ class SparseStyleTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Writes config.yml into the run's folder; `ns-train` calls it right before it starts processes."""
         if self.machine.num_devices * self.machine.num_machines > 1:
-            prepare_launch(self.machine.device_type)
+            prepare_launch()
         try:
             self.get_base_dir().mkdir(parents=True, exist_ok=True)
             write_text_whole(self.get_base_dir() / "config.yml", yaml.dump(self))

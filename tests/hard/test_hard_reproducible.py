@@ -124,8 +124,8 @@ def test_a_killed_run_ends_as_one_that_was_left_alone(command, uninterrupted, tm
 )
 def test_a_run_killed_at_odd_moments_ends_as_one_that_was_left_alone(command, tmp_path):
     method, checkpoints, more = "coarse-fewshot", tmp_path / "none", []
-    often = ["--max-num-iterations", "60", "--steps-per-save", "1"]
-    for attempt, delay in enumerate((0.0, 0.15, 0.4)):
+    often = ["--max-num-iterations", "100", "--steps-per-save", "1"]
+    for attempt, delay in enumerate((0.0, 0.1, 0.3)):
         outputs = tmp_path / str(attempt)
         outputs.mkdir()
         process = trial.start(trial.train, outputs / "log.txt", command(method, outputs, *often, *more))
