@@ -48,6 +48,8 @@ bench: $(READY)
 	done; for peer in even vanilla-nerf; do \
 	    $(BIN)/python -m benchmarks.stage1 --peer $$peer $(BENCH); \
 	done
+	$(BIN)/python -m benchmarks.stability --method coarse-fewshot-draft $(BENCH)
+	$(BIN)/python -m benchmarks.stability --method hier-style-draft $(BENCH)
 	$(BIN)/python -m benchmarks.summary $(BENCH)
 
 $(READY): pyproject.toml constraints.txt | $(BIN)/python

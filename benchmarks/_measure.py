@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.whole_files import write_text_whole
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -346,9 +347,7 @@ def write_json(path: Path, content: Any) -> Path:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_name(path.name + ".unfinished")
-        unfinished.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-        os.replace(unfinished, path)
+        write_text_whole(path, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
     except OSError as error:
         raise InputError(f"{path} can't be written ({error.strerror}); name another --output-dir.") from error
     return path

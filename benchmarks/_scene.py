@@ -21,6 +21,7 @@ from nerfstudio.field_components.encodings import HashEncoding
 from nerfstudio.field_components.mlp import MLP
 from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor, nn
+from torch.amp import GradScaler
 from torch.utils.checkpoint import checkpoint
 
 from benchmarks._measure import CACHE, ROOT, Options
@@ -31,6 +32,7 @@ from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField, fine_density
+from sparsestyle_ns.finite_steps import FiniteOptimizers
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
@@ -41,6 +43,7 @@ from sparsestyle_ns.rendering.space import Space
 from sparsestyle_ns.rendering.volume import over_background
 from sparsestyle_ns.scene_record import record_scene
 from sparsestyle_ns.schedules import content_weight
+from sparsestyle_ns.trainer import SparseStyleTrainerConfig
 
 BACKBONE = "vgg16-shift-tolerant"
 """The feature network of all benchmarks: its weights are on every machine, so that figures can be compared."""
@@ -179,7 +182,9 @@ class Training:
         self.pipeline: Any = config.pipeline.setup(device=str(device), test_mode="val", world_size=1, local_rank=0)
         if coarse is not None:
             self.pipeline.model.adopt_coarse(coarse.model_state())
-        self.optimizers = Optimizers(copy.deepcopy(config.optimizers), self.pipeline.get_param_groups())
+        kind = FiniteOptimizers if isinstance(config, SparseStyleTrainerConfig) else Optimizers
+        self.optimizers = kind(copy.deepcopy(config.optimizers), self.pipeline.get_param_groups())
+        self.grad_scaler = GradScaler(device.type, enabled=False)
         attributes = TrainingCallbackAttributes(
             optimizers=self.optimizers,
             grad_scaler=None,
@@ -189,18 +194,20 @@ class Training:
         self.callbacks = self.pipeline.get_training_callbacks(attributes)
         self.num_steps = 0
 
-    def step(self) -> None:
-        """One iteration."""
+    def step(self) -> Tensor:
+        """One iteration; returns its loss."""
         self.pipeline.train()
         for callback in self.callbacks:
             callback.run_callback_at_location(self.num_steps, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
         self.optimizers.zero_grad_all()
         _, losses, _ = self.pipeline.get_train_loss_dict(self.num_steps)
-        functools.reduce(torch.add, losses.values()).backward()
-        self.optimizers.optimizer_step_all()
+        loss = functools.reduce(torch.add, losses.values())
+        loss.backward()
+        self.optimizers.optimizer_scaler_step_some(self.grad_scaler, list(self.optimizers.parameters))
         for scheduler in self.optimizers.schedulers.values():
             scheduler.step()
         self.num_steps += 1
+        return loss.detach()
 
 
 # ------------------------------------------------------------------------------------------------------- the plain way

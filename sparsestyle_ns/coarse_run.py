@@ -1,8 +1,9 @@
 """Finding and reading the coarse run that a stylised run builds on."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Dict, Iterable, List, Optional
+from typing import Any, Dict, Iterable, List, Optional
 
 import torch
 import yaml
@@ -35,7 +36,7 @@ class CoarseRun:
 
     def model_state(self) -> Dict[str, Tensor]:
         """The state of the run's model."""
-        state = torch.load(self.checkpoint, map_location="cpu", weights_only=True)["pipeline"]
+        state = load_checkpoint(self.checkpoint)["pipeline"]
         prefix = "_model."
         return {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
 
@@ -46,8 +47,27 @@ def checkpoint_step(path: Path) -> int:
 
 
 def newest_checkpoint(folder: Path) -> Optional[Path]:
-    """The checkpoint of the last iteration in a folder; None where there is none."""
-    return max(folder.glob("step-*.ckpt"), key=checkpoint_step, default=None)
+    """The checkpoint of the last iteration in a folder, whatever else is in it; None where there is none."""
+    checkpoints = (path for path in folder.glob("step-*.ckpt") if re.fullmatch(r"step-\d+", path.stem))
+    return max(checkpoints, key=checkpoint_step, default=None)
+
+
+def load_checkpoint(path: Path) -> Dict[str, Any]:
+    """What is in a checkpoint, with its tensors on the CPU.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged archive can fail in many ways
+        raise InputError(
+            f"The checkpoint {path} can't be read, it may have been cut short in copying: copy it again, or delete it "
+            "and go on from an earlier one."
+        ) from error
+    if not isinstance(state, dict) or not {"step", "pipeline"} <= state.keys():
+        raise InputError(f"{path} is no checkpoint of a run: name a step-….ckpt that ns-train made.")
+    return state
 
 
 def read_coarse_run(path: Path) -> CoarseRun:

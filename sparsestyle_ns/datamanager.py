@@ -1,6 +1,7 @@
 """Photos and rays for training on a few views, whatever nerfstudio dataparser reads them."""
 
 import copy
+import functools
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Dict, Literal, Optional, Tuple, Type, Union
@@ -10,13 +11,17 @@ import tyro
 from jaxtyping import Float, Int
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
-from PIL import Image
 from torch import Tensor
 
+from sparsestyle_ns.dataparsers.transforms import check_transforms
+from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.photos import PhotoDataset, check_one_size, open_photo
+from sparsestyle_ns.processes import num_processes
 from sparsestyle_ns.view_selection import BLENDER_VIEWS, DEFAULT_NUM_VIEWS, select_views
 
 
@@ -59,7 +64,7 @@ class TrainingPixels:
     trusted: Int[Tensor, "trusted"]
 
 
-class FewShotDataManager(VanillaDataManager[InputDataset]):
+class FewShotDataManager(VanillaDataManager[PhotoDataset]):
     """Keeps the few training views, and all their rays, in memory.
 
     It chooses the views (`select_views`), reduces large photos, and adds to the datasets' metadata what the models need
@@ -68,7 +73,17 @@ class FewShotDataManager(VanillaDataManager[InputDataset]):
 
     config: FewShotDataManagerConfig
 
-    def create_train_dataset(self) -> InputDataset:
+    @property
+    def dataparser(self) -> DataParser:
+        """nerfstudio's reader of the scene."""
+        return self._dataparser
+
+    @dataparser.setter
+    def dataparser(self, parser: DataParser) -> None:
+        parser.get_dataparser_outputs = functools.partial(read_scene, parser)
+        self._dataparser = parser
+
+    def create_train_dataset(self) -> PhotoDataset:
         """The dataset of the selected views only."""
         outputs = self.train_dataparser_outputs
         ids = outputs.metadata.get("view_ids", list(range(len(outputs.image_filenames))))
@@ -80,6 +95,9 @@ class FewShotDataManager(VanillaDataManager[InputDataset]):
         chosen = select_views(ids, self.config.num_views, self.config.view_ids, default, standard)
         self.view_ids = tuple(ids[position] for position in chosen)
         self.train_dataparser_outputs = select_outputs(outputs, chosen)
+        if len(outputs.cameras.width.unique()) == len(outputs.cameras.height.unique()) == 1:
+            # Blender's cameras have the size of the first photo, also where that isn't trained on.
+            check_one_size([outputs.image_filenames[0], *self.train_dataparser_outputs.image_filenames])
         if self.test_mode == "val":
             names = ", ".join(path.name for path in self.train_dataparser_outputs.image_filenames)
             CONSOLE.print(
@@ -87,7 +105,7 @@ class FewShotDataManager(VanillaDataManager[InputDataset]):
             )
         return self._dataset(self.train_dataparser_outputs, space)
 
-    def create_eval_dataset(self) -> InputDataset:
+    def create_eval_dataset(self) -> PhotoDataset:
         """The dataparser's whole held-out split; the training views where it holds out none, as of very few photos."""
         outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
         if not outputs.image_filenames:
@@ -95,7 +113,7 @@ class FewShotDataManager(VanillaDataManager[InputDataset]):
             outputs = self.train_dataparser_outputs
         return self._dataset(outputs, self.train_dataset.metadata["space"])
 
-    def _dataset(self, outputs: DataparserOutputs, space: str) -> InputDataset:
+    def _dataset(self, outputs: DataparserOutputs, space: str) -> PhotoDataset:
         limit = self.config.max_image_side
         longest = int(max(outputs.cameras.width.max(), outputs.cameras.height.max()))
         scale = self.config.camera_res_scale_factor
@@ -124,8 +142,57 @@ class FewShotDataManager(VanillaDataManager[InputDataset]):
         return bundle_rays(self.pixels, rows), {"image": self.pixels.colors[rows]}
 
     def get_train_rays_per_batch(self) -> int:
-        """Rays in a batch of `next_train`."""
-        return self.config.train_num_rays_per_batch
+        """Rays of a batch that this process renders."""
+        return self.config.train_num_rays_per_batch // num_processes()
+
+
+def read_scene(parser: DataParser, split: str = "train", **kwargs: Any) -> DataparserOutputs:
+    """What a dataparser says of one split of a scene, checked; nerfstudio's own parsers check next to nothing.
+
+    Raises:
+        InputError: the scene can't be read, or a camera in it is none.
+    """
+    config = parser.config
+    name = type(config).__name__.removesuffix("DataParserConfig").lower()
+    if isinstance(config, BlenderDataParserConfig):
+        frames = check_transforms(config.data / f"transforms_{split}.json", with_angle=True)
+        open_photo(config.data / f"{frames[0].replace('./', '')}.png")  # gives all cameras of the split their size
+    elif isinstance(config, NerfstudioDataParserConfig):
+        is_file = config.data.suffix == ".json"
+        check_transforms(config.data if is_file else config.data / "transforms.json", with_angle=False)
+    try:
+        outputs = DataParser.get_dataparser_outputs(parser, split, **kwargs)
+    except InputError:
+        raise
+    except Exception as error:  # a file that isn't as a parser expects it shows itself in any kind of error
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"{config.data} can't be read as a scene of the kind {name} ({type(error).__name__}: {reason}); correct "
+            "its files, or choose the dataparser that they were made for."
+        ) from error
+    check_cameras(outputs)
+    return outputs
+
+
+def check_cameras(outputs: DataparserOutputs) -> None:
+    """Makes sure that cameras are finite and have an angle of view.
+
+    Raises:
+        InputError: one isn't or hasn't; its photo is named.
+    """
+    cameras = outputs.cameras
+    if len(cameras) == 0:  # a split may be empty
+        return
+    numbers = [cameras.camera_to_worlds.flatten(1), cameras.fx, cameras.fy, cameras.cx, cameras.cy]
+    usable = torch.cat([part.reshape(len(cameras), -1) for part in numbers], dim=-1).isfinite().all(dim=-1)
+    for part in (cameras.fx, cameras.fy, cameras.width, cameras.height):
+        usable &= (part > 0).reshape(len(cameras), -1).all(dim=-1)
+    if not usable.all():
+        photo = outputs.image_filenames[int((~usable).nonzero()[0])]
+        raise InputError(
+            f"The camera of {photo} has a pose that is not finite, or a focal length or size that is not above 0: "
+            "correct it, or take the photo out of the scene."
+        )
 
 
 def scene_space(outputs: DataparserOutputs) -> Literal["ndc", "box", "contracted"]:
@@ -137,8 +204,8 @@ def scene_space(outputs: DataparserOutputs) -> Literal["ndc", "box", "contracted
 
 def has_transparency(path: Path) -> bool:
     """Whether an image has an alpha channel with anything but full opacity in it."""
-    with Image.open(path) as image:
-        return "A" in image.getbands() and image.getchannel("A").getextrema()[0] < 255
+    image = open_photo(path)
+    return "A" in image.getbands() and image.getchannel("A").getextrema()[0] < 255
 
 
 def select_outputs(outputs: DataparserOutputs, positions: Tuple[int, ...]) -> DataparserOutputs:

@@ -53,11 +53,13 @@ def load_run(config_path: Path) -> Tuple[Any, Any, int]:
     folder = config_path.resolve().parent
 
     def where_it_is_now(config: Any) -> Any:
-        from sparsestyle_ns.coarse_run import newest_checkpoint
+        from sparsestyle_ns.coarse_run import checkpoint_step, newest_checkpoint
         from sparsestyle_ns.scene_record import SceneRecord
 
-        if newest_checkpoint(folder / config.relative_model_dir) is None:
+        newest = newest_checkpoint(folder / config.relative_model_dir)
+        if newest is None:
             raise InputError(f"{folder} has no checkpoint yet; train it, or name another run.")
+        config.load_step = checkpoint_step(newest)
         # nerfstudio joins these four to find the checkpoints, from the folder that the command was started in.
         config.output_dir, config.experiment_name = folder.parents[2], folder.parents[1].name
         config.method_name, config.timestamp = folder.parent.name, folder.name

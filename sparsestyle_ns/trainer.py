@@ -1,25 +1,38 @@
 """nerfstudio's trainer, made to keep what it has: whole checkpoints, also on Ctrl-C, and resuming where it stopped."""
 
 import copy
-import os
 import signal
 import warnings
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Dict, List, Literal, Tuple, Type
+from typing import Any, Dict, List, Literal, Optional, Tuple, Type
 
 import numpy as np
 import torch
+import yaml
 from nerfstudio.configs.base_config import MachineConfig
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sparsestyle_ns.coarse_run import CoarseRun, check_scene, find_coarse_run, newest_checkpoint, read_coarse_run
+from sparsestyle_ns.coarse_run import (
+    CoarseRun,
+    check_scene,
+    find_coarse_run,
+    load_checkpoint,
+    newest_checkpoint,
+    read_coarse_run,
+)
 from sparsestyle_ns.errors import InputError, exit_on_input_error
+from sparsestyle_ns.finite_steps import FiniteOptimizers
+from sparsestyle_ns.processes import any_process, from_first_process, prepare_launch, share_state
 from sparsestyle_ns.scene_record import SceneRecord, record_scene
+from sparsestyle_ns.whole_files import write_text_whole, write_whole
+
+STEPS_PER_LOOK = 10
+"""Iterations between looks at the count of skipped steps, each of which waits for a GPU."""
 
 
 def this_machine() -> MachineConfig:
@@ -44,12 +57,18 @@ class SparseStyleTrainerConfig(TrainerConfig):
     _target: Type = field(default_factory=lambda: SparseStyleTrainer)
     machine: MachineConfig = field(default_factory=this_machine)
     """Where to run; the GPU where there is one."""
+    max_skipped_steps: int = 20
+    """Iterations in a row, at least 1, whose gradient isn't finite and whose step is therefore skipped, after which
+    training stops."""
 
     @exit_on_input_error
     def save_config(self) -> None:
-        """Writes config.yml into the run's folder."""
+        """Writes config.yml into the run's folder; `ns-train` calls it right before it starts processes."""
+        if self.machine.num_devices * self.machine.num_machines > 1:
+            prepare_launch()
         try:
-            super().save_config()
+            self.get_base_dir().mkdir(parents=True, exist_ok=True)
+            write_text_whole(self.get_base_dir() / "config.yml", yaml.dump(self))
         except OSError as error:
             raise InputError(
                 f"The run can't be saved in {self.get_base_dir()} ({error.strerror}); name a folder that can be "
@@ -65,11 +84,24 @@ class SparseStyleTrainer(Trainer):
     """The trainer of both methods."""
 
     config: SparseStyleTrainerConfig
+    optimizers: FiniteOptimizers
 
     @exit_on_input_error
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Sets up the run and records what it is trained on."""
+        if self.config.max_skipped_steps < 1:
+            raise InputError(f"--max-skipped-steps is {self.config.max_skipped_steps}; give 1 or more.")
+        self._reported = 0
+        self._kept_step: Optional[int] = None
         super().setup(test_mode)
+        self._save_record()
+
+    def setup_optimizers(self) -> Optimizers:
+        """Optimisers that skip steps whose gradient isn't finite."""
+        return FiniteOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
+
+    @check_main_thread
+    def _save_record(self) -> None:
         record_scene(self.pipeline.datamanager).save(self.base_dir)
 
     def _load_checkpoint(self) -> None:
@@ -78,11 +110,31 @@ class SparseStyleTrainer(Trainer):
                 raise InputError(
                     f"There is nothing to resume at {source}; name a folder of checkpoints or a .ckpt file."
                 )
-        if self.config.load_dir is not None and newest_checkpoint(self.config.load_dir) is None:
-            raise InputError(
-                f"There is no checkpoint in {self.config.load_dir}; name a run's nerfstudio_models folder."
-            )
-        super()._load_checkpoint()
+        checkpoint = self._checkpoint_to_resume()
+        if checkpoint is not None:
+            self._resume(load_checkpoint(checkpoint))
+            CONSOLE.print(f"Going on from {checkpoint}.", soft_wrap=True)
+        share_state(self.pipeline.model)
+
+    def _resume(self, state: Dict[str, Any]) -> None:
+        """Takes over all of a checkpoint, as nerfstudio does."""
+        self.pipeline.load_pipeline(state["pipeline"], state["step"])
+        self.optimizers.load_optimizers(state["optimizers"])
+        if self.config.load_scheduler:
+            self.optimizers.load_schedulers(state["schedulers"])
+        self.grad_scaler.load_state_dict(state["scalers"])
+        self._start_step = state["step"] + 1
+        self._kept_step = state["step"]
+
+    def _checkpoint_to_resume(self) -> Optional[Path]:
+        folder, step = self.config.load_dir, self.config.load_step
+        if folder is None:
+            return self.config.load_checkpoint
+        checkpoint = newest_checkpoint(folder) if step is None else folder / f"step-{step:09d}.ckpt"
+        if checkpoint is None or not checkpoint.is_file():
+            what = "checkpoint" if step is None else f"checkpoint of iteration {step}"
+            raise InputError(f"There is no {what} in {folder}; name a run's nerfstudio_models folder.")
+        return checkpoint
 
     @exit_on_input_error
     def train(self) -> None:
@@ -97,7 +149,7 @@ class SparseStyleTrainer(Trainer):
                 "train on."
             )
         self._interrupted = False
-        former = signal.signal(signal.SIGINT, self._on_interrupt) if self.local_rank == 0 else None
+        former = signal.signal(signal.SIGINT, self._on_interrupt)
         self.config.max_num_iterations = total - self._start_step
         try:
             super().train()
@@ -106,8 +158,7 @@ class SparseStyleTrainer(Trainer):
             CONSOLE.print(f"Stopped after iteration {self.step + 1} of {total}; the checkpoint is saved.")
         finally:
             self.config.max_num_iterations = total
-            if former is not None:
-                signal.signal(signal.SIGINT, former)
+            signal.signal(signal.SIGINT, former)
         self.report(interrupted=self._interrupted)
 
     def _on_interrupt(self, number: int, frame: Any) -> None:
@@ -117,11 +168,39 @@ class SparseStyleTrainer(Trainer):
         CONSOLE.print("Ctrl-C: finishing this iteration, then saving. Press it again to stop at once.")
 
     def train_iteration(self, step: int) -> Any:
-        """One iteration; raises `TrainingInterruptedError` after it if Ctrl-C was pressed."""
+        """One iteration.
+
+        Raises:
+            TrainingInterruptedError: Ctrl-C was pressed, in any process.
+            InputError: the gradients of too many iterations in a row weren't finite.
+        """
         result = super().train_iteration(step)
+        if (step + 1) % STEPS_PER_LOOK == 0:
+            self._look_at_skipped(step)
+        self._interrupted = any_process(self._interrupted, self.pipeline.device)
         if self._interrupted:
             raise TrainingInterruptedError
         return result
+
+    def _look_at_skipped(self, step: int) -> int:
+        """Reports steps that were skipped since the last look; returns how many were, in a row, up to now."""
+        total, in_a_row = self.optimizers.skipped()
+        if total > self._reported:
+            CONSOLE.print(
+                f"Steps skipped up to iteration {step + 1}, because their gradients weren't finite: "
+                f"{total - self._reported} ({total} in all)."
+            )
+            writer.put_scalar(name="Skipped Steps", scalar=total, step=step)
+            self._reported = total
+        if in_a_row >= self.config.max_skipped_steps:
+            kept = "No checkpoint was saved before."
+            if self._kept_step is not None:
+                kept = f"The checkpoint of iteration {self._kept_step + 1} is from before and stays."
+            raise InputError(
+                f"Training stopped after iteration {step + 1}, because the gradients of the last {in_a_row} weren't "
+                "finite; try a lower learning rate, --optimizers.fields.optimizer.lr. " + kept
+            )
+        return in_a_row
 
     def report(self, interrupted: bool) -> None:
         """Prints what was made and what to type next."""
@@ -145,22 +224,48 @@ class SparseStyleTrainer(Trainer):
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Saves a checkpoint as nerfstudio does, but never a half-written one: it gets its name when it is whole."""
-        self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
+        """Saves a checkpoint as nerfstudio does, but only whole and finite ones, and drops the former one after that.
+
+        While steps are being skipped, the state is under suspicion: nothing is saved then, and at the end of training
+        the former checkpoint is kept beside the last.
+
+        Raises:
+            InputError: there is a number in it that isn't finite, or the disk is full or can't be written to.
+        """
+        suspect = self._look_at_skipped(step) > 0
+        ends = self._interrupted or step + 1 == self._start_step + self.config.max_num_iterations
+        if suspect and not ends:
+            CONSOLE.print(f"No checkpoint of iteration {step + 1}: its step was skipped.")
+            return
         target = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        unfinished = self.base_dir / "checkpoint.unfinished"  # nerfstudio takes every file beside `target` for one
         state = {
             "step": step,
-            "pipeline": getattr(self.pipeline, "module", self.pipeline).state_dict(),
+            "pipeline": self.pipeline.state_dict(),
             "optimizers": {name: part.state_dict() for name, part in self.optimizers.optimizers.items()},
             "schedulers": {name: part.state_dict() for name, part in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
             **self.notes(),
         }
-        torch.save(without_numpy_scalars(state), unfinished)
-        os.replace(unfinished, target)
-        if self.config.save_only_latest_checkpoint:
-            for path in self.checkpoint_dir.glob("*.ckpt"):
+        for name, tensor in state["pipeline"].items():
+            if tensor.is_floating_point() and not tensor.isfinite().all():
+                raise InputError(
+                    f"Iteration {step + 1} isn't saved, because {name} isn't finite in it; go on from an earlier "
+                    "checkpoint with a lower learning rate, --optimizers.fields.optimizer.lr."
+                )
+        # nerfstudio takes every file in the folder of checkpoints for one, so the unfinished one is kept outside.
+        unfinished = self.base_dir / "checkpoint.unfinished"
+        try:
+            self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
+            write_whole(target, lambda file: torch.save(without_numpy_scalars(state), file), unfinished)
+        except (OSError, RuntimeError) as error:  # torch's writer makes a RuntimeError of some OSErrors
+            unfinished.unlink(missing_ok=True)
+            raise InputError(
+                f"The checkpoint of iteration {step + 1} can't be saved in {self.checkpoint_dir} ({error}); the former "
+                "one is still there. Make room, and go on from it with --load-dir."
+            ) from error
+        self._kept_step = step
+        if self.config.save_only_latest_checkpoint and not suspect:
+            for path in self.checkpoint_dir.glob("step-*.ckpt"):
                 if path != target:
                     path.unlink()
 
@@ -222,7 +327,11 @@ class HierStyleTrainer(SparseStyleTrainer):
         self._coarse_state = None if run is None else run.model_state()
         super().setup(test_mode)
         self.config.pipeline.backbone = self.pipeline.targets.backbone.description.name
-        self.config.save_config()
+        self._write_config(self.config)
+
+    @check_main_thread
+    def _write_config(self, config: TrainerConfig) -> None:
+        config.save_config()
 
     def notes(self) -> Dict[str, Any]:
         """Which feature network stylised the scene, and where its weights came from."""
@@ -236,8 +345,6 @@ class HierStyleTrainer(SparseStyleTrainer):
 
     def _adopt_shape_of_checkpoint(self) -> None:
         """Takes the coarse field's settings from the run that is resumed; they came from its coarse run."""
-        import yaml
-
         folder = self.config.load_dir or self.config.load_checkpoint.parent
         path = folder.parent / "config.yml"
         if path.is_file():
@@ -260,7 +367,7 @@ class HierStyleTrainer(SparseStyleTrainer):
             return run
         draft = self.config.method_name.endswith("-draft")
         methods = ("coarse-fewshot", "coarse-fewshot-draft") if draft else ("coarse-fewshot",)
-        found = find_coarse_run(self.config.output_dir, methods, scene)
+        found = from_first_process(find_coarse_run(self.config.output_dir, methods, scene))
         if found is not None:
             CONSOLE.print(f"Stylising the newest coarse run of this scene, {found.folder}.")
             return found
@@ -292,7 +399,8 @@ class HierStyleTrainer(SparseStyleTrainer):
         config.vis = "tensorboard"
         config.viewer.quit_on_train_completion = True
         config.set_timestamp()
-        config.save_config()
+        config.timestamp = from_first_process(config.timestamp)
+        self._write_config(config)
         trainer = config.setup(local_rank=self.local_rank, world_size=self.world_size)
         trainer.setup()
         trainer.train()
@@ -302,6 +410,7 @@ class HierStyleTrainer(SparseStyleTrainer):
             )
         for state in (writer.EVENT_WRITERS, writer.EVENT_STORAGE, writer.GLOBAL_BUFFER):
             state.clear()
+        from_first_process(None)  # the others wait here until it has saved
         return read_coarse_run(trainer.base_dir)
 
     def next_commands(self, config: Path) -> List[str]:

@@ -39,6 +39,8 @@ def select_views(
     Raises:
         InputError: an id is not available or given twice, or fewer than one view is asked for.
     """
+    if not available:
+        raise InputError("The scene has no view that can be trained on; give it photos with camera poses.")
     position = {view: index for index, view in enumerate(available)}
     if view_ids is not None:
         missing = [view for view in view_ids if view not in position]

@@ -11,7 +11,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))  # benchmarks isn't in
 
 from nerfstudio.data.scene_box import SceneBox
 
-from benchmarks import _measure, _scene, nnfm, stage1, summary
+from benchmarks import _measure, _scene, nnfm, stability, stage1, summary
 from benchmarks._measure import Duration, Options, Ratio, Report
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.field_components.hash_grid import HashGrid
@@ -337,3 +337,19 @@ def test_a_benchmark_can_be_run_as_a_command(tmp_path):
     assert content["quick"]
     assert [row["name"] for row in content["rows"]] == ["hash_grid_forward", "hash_grid_forward_backward"]
     assert all(len(one["seconds"]) == 1 for part in content["repetitions"].values() for one in part.values())
+
+
+# ---------------------------------------------------------------------------------------------------------- stability
+
+
+def test_the_largest_stable_rate_is_the_last_before_the_first_that_fails():
+    trials = [stability.Trial(1.0, 0.2, 0), stability.Trial(2.0, 0.1, 0), stability.Trial(4.0, 0.29, 0)]
+    assert stability.largest_stable(trials) == 4.0
+    for loss, skipped in ((0.31, 0), (0.1, 1), (float("nan"), 0), (float("inf"), 0)):
+        bad = stability.Trial(8.0, loss, skipped)
+        assert stability.largest_stable([*trials, bad, stability.Trial(16.0, 0.1, 0)]) == 4.0
+
+
+def test_a_default_that_doesnt_train_is_said():
+    with pytest.raises(InputError, match="Not even the default"):
+        stability.largest_stable([stability.Trial(1.0, float("nan"), 0)])

@@ -16,6 +16,7 @@ from sparsestyle_ns.field_components.thinned_mlp import Thinning
 from sparsestyle_ns.fields.coarse import CoarseField, DensityActivation
 from sparsestyle_ns.losses.geometry import near_density
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
+from sparsestyle_ns.processes import num_processes, own_share, put_together
 from sparsestyle_ns.rendering.compositing import distortion, effective_samples
 from sparsestyle_ns.rendering.density_grid import DensityGrid
 from sparsestyle_ns.rendering.precision import Precision, autocast
@@ -151,25 +152,35 @@ class CoarseFewShotModel(Model):
         )
 
     def render(
-        self, ray_bundle: RayBundle, num_samples: int, generator: Optional[torch.Generator]
-    ) -> Tuple[DenseRender, Segments, Tensor]:
-        """Renders rays; also returns their segments and the samples' borders."""
-        segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
-        edges = self.place_samples(segments, num_samples, generator)
-        thinning = Thinning(self.config.thinning, generator) if self.training and self.config.thinning > 0 else None
+        self, segments: Segments, directions: Tensor, edges: Tensor, thinning: Optional[Thinning] = None
+    ) -> DenseRender:
+        """Renders rays with the samples that `edges` bound."""
         with autocast(self.device, self.config.precision):
-            render = render_coarse(
-                self.field, segments, ray_bundle.directions, edges, self.space.unbounded, self.background, thinning
+            return render_coarse(
+                self.field, segments, directions, edges, self.space.unbounded, self.background, thinning
             )
-        return render, segments, edges
+
+    def render_batch(self, origins: Tensor, directions: Tensor) -> Tuple[DenseRender, Tensor]:
+        """Renders the rays of a training step, each process its share; also returns the samples' borders."""
+        segments = self.space.segments(origins, directions)
+        generator = self._generator()
+        edges = self.place_samples(segments, self.config.num_samples, generator)
+        thinning = Thinning(self.config.thinning, generator) if self.config.thinning > 0 else None
+        if num_processes() == 1:
+            return self.render(segments, directions, edges, thinning), edges
+        segments = self.space.segments(own_share(origins), own_share(directions))
+        own = self.render(segments, own_share(directions), own_share(edges), thinning)
+        return DenseRender(**{name: put_together(part, len(edges)) for name, part in vars(own).items()}), edges
 
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
         """`rgb`, `accumulation`, and `depth` in world units; in training also what the losses need."""
         if not self.training:
-            render, segments, _ = self.render(ray_bundle, self.config.num_eval_samples, None)
+            segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
+            edges = self.place_samples(segments, self.config.num_eval_samples, None)
+            render = self.render(segments, ray_bundle.directions, edges)
             depth = segments.distance(render.s.clamp(max=1.0 - 1e-4))
             return {"rgb": render.rgb, "accumulation": render.accumulation, "depth": depth}
-        render, _, edges = self.render(ray_bundle, self.config.num_samples, self._generator())
+        render, edges = self.render_batch(ray_bundle.origins, ray_bundle.directions)
         if self.grid is not None:
             self.grid.remember(render.positions, render.density)
         return {

@@ -1,8 +1,9 @@
 """What the pipelines of both methods have in common."""
 
-from typing import Any, Dict, Literal
+from typing import Any, Dict, Literal, Optional
 
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from torch.amp import GradScaler
 
 from sparsestyle_ns.errors import InputError, exit_on_input_error
 from sparsestyle_ns.ffmpeg import put_ffmpeg_on_path
@@ -15,9 +16,16 @@ class CheckedPipeline(VanillaPipeline):
 
     @exit_on_input_error
     def __init__(
-        self, config: VanillaPipelineConfig, device: str, test_mode: TestMode = "val", *args: Any, **kwargs: Any
+        self,
+        config: VanillaPipelineConfig,
+        device: str,
+        test_mode: TestMode = "val",
+        world_size: int = 1,
+        local_rank: int = 0,
+        grad_scaler: Optional[GradScaler] = None,
     ) -> None:
-        super().__init__(config, device, test_mode, *args, **kwargs)
+        # However many processes there are, the model is not to be wrapped (see `processes`).
+        super().__init__(config, device, test_mode, 1, local_rank, grad_scaler)
         if test_mode != "val":
             put_ffmpeg_on_path()
 

@@ -21,9 +21,11 @@ from torch import Tensor
 
 from sparsestyle_ns.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.finite_steps import broken, step_if_finite
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
 from sparsestyle_ns.pipelines.base import CheckedPipeline
+from sparsestyle_ns.processes import average_gradients, num_processes, own_share, put_together
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.volume import accumulation_of
 from sparsestyle_ns.schedules import content_weight
@@ -155,7 +157,7 @@ class HierStylePipeline(CheckedPipeline):
             keep_bytes -= view.kept_bytes
             frozen.append(view)
             pictures.append(pixels.colors[rows].view(height, width, 3))
-            weights.append(view.render(accumulation_of).view(height, width))
+            weights.append(put_together(view.render(accumulation_of), height * width).view(height, width))
         for camera in self._novel_cameras():
             bundle = camera.generate_rays(camera_indices=0, keep_shape=True).to(self.device)
             rays = bundle.flatten()
@@ -179,7 +181,7 @@ class HierStylePipeline(CheckedPipeline):
         if self.config.cache_gigabytes is not None:
             return self.config.cache_gigabytes * 2**30
         free = torch.cuda.mem_get_info()[0] if self.device.type == "cuda" else psutil.virtual_memory().available
-        return free / 4
+        return free / 4 / num_processes()
 
     def _report_cache(self) -> None:
         kept = sum(view.frozen.kept_bytes for view in self.views)
@@ -192,7 +194,14 @@ class HierStylePipeline(CheckedPipeline):
         )
 
     def _freeze(self, origins: Tensor, directions: Tensor, keep_bytes: float) -> FrozenView:
+        """The rays of a view that this process renders."""
+        origins, directions = own_share(origins), own_share(directions)
         return self.model.freeze_view(origins, directions, self.config.samples_per_chunk, keep_bytes)
+
+    def _render(self, view: ContentView, coarse_geometry: bool = False) -> Float[Tensor, "H W 3"]:
+        """The stylised picture of a view, of which each process renders its share of the rays."""
+        own = view.frozen.render(lambda chunk: self.model.stylised(chunk, coarse_geometry).rgb)
+        return put_together(own, view.picture[..., 0].numel()).view(view.picture.shape)
 
     def _novel_cameras(self) -> List[Cameras]:
         """Cameras half way, a third of the way … between neighbouring training views."""
@@ -244,21 +253,23 @@ class HierStylePipeline(CheckedPipeline):
         this.
         """
         photos = self.views[: len(self.datamanager.pixels.sizes)]
-        optimizer = torch.optim.Adam(self.model.residual.parameters(), lr=WARM_START_LEARNING_RATE, fused=True)
+        parameters = list(self.model.residual.parameters())
+        optimizer = torch.optim.Adam(parameters, lr=WARM_START_LEARNING_RATE, fused=True)
         for step in track(range(self.config.warm_start_steps), description="Warm start", transient=True):
             view = photos[step % len(photos)]
-            colors = view.frozen.render(lambda chunk: self.model.stylised(chunk, coarse_geometry=True).rgb)
-            loss = reconstruction_loss(colors, view.picture.view(-1, 3))
+            loss = reconstruction_loss(self._render(view, coarse_geometry=True), view.picture)
             optimizer.zero_grad()
             loss.backward()
-            optimizer.step()
+            average_gradients(parameters)
+            if step_if_finite(optimizer, broken(parameters)):
+                optimizer.step()
         optimizer.zero_grad()
 
     def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Tensor], Dict[str, Tensor], Dict[str, Any]]:
         """One whole view: λ(t) L_content and L_style (Eq. 5 and 6)."""
         assert self.targets is not None
         view = self.views[step % len(self.views)]
-        image = view.frozen.render(lambda chunk: self.model.stylised(chunk).rgb).view(view.picture.shape)
+        image = self._render(view)
         style, content = self.targets.losses(image, view.features, view.accumulation)
         config = self.config
         weight = content_weight(step, config.content_weight, config.content_decay, config.content_steps)

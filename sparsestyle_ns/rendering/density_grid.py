@@ -57,10 +57,14 @@ class DensityGrid(nn.Module):
     def remember(
         self, positions: Float[Tensor, "*batch 3"], density: Float[Tensor, "*batch"], decay: float = 0.8
     ) -> None:
-        """Takes note of densities seen at positions: the larger of them and `decay` times what the cell had."""
+        """Takes note of densities seen at positions: the larger of them and `decay` times what the cell had.
+
+        A density that isn't finite is no news: the step it comes from is skipped, but what the grid holds would stay.
+        """
         cells = self.cells(positions).reshape(-1)
+        seen = density.detach().reshape(-1).to(self.density)
         self.density[cells] *= decay
-        self.density.scatter_reduce_(0, cells, density.detach().reshape(-1).to(self.density), reduce="amax")
+        self.density.scatter_reduce_(0, cells, seen.where(seen.isfinite(), 0.0), reduce="amax")
 
     @torch.no_grad()
     def place_samples(

@@ -91,7 +91,9 @@ def _outcomes(terminalreporter: pytest.TerminalReporter) -> Dict[Row, str]:
     seen: Dict[Row, Counter] = {}
     for reports in terminalreporter.stats.values():
         for report in reports:
-            for name, value in getattr(report, "user_properties", ()):
+            if not isinstance(report, pytest.TestReport):  # tests that were deselected stand here too, as they are
+                continue
+            for name, value in report.user_properties:
                 if name == PROPERTY:
                     seen.setdefault(Row(*value), Counter())[report.outcome] += 1
     return {row: next(key for key in ("failed", "skipped", "passed") if found[key]) for row, found in seen.items()}

@@ -1,0 +1,152 @@
+"""Several processes that train together give what one process gives."""
+
+from pathlib import Path
+from typing import Any, Dict
+
+import pytest
+import torch
+import torch.distributed as dist
+from conftest import TINY, TINY_STYLE, ns_train, only_run
+from hard import trial
+from hard.table import hard_case
+from torch import nn
+from torch.amp import GradScaler
+
+from sparsestyle_ns import processes
+from sparsestyle_ns.coarse_run import load_checkpoint, newest_checkpoint
+from sparsestyle_ns.finite_steps import FiniteOptimizers
+from sparsestyle_ns.trainer import FusedAdamConfig
+
+TWO = ["--machine.num-devices", "2", "--machine.device-type", "cpu"]
+COMMON = ["--pipeline.model.precision", "float32", "--max-num-iterations", "6", "--steps-per-eval-image", "0"]
+
+
+def weights(outputs: Path, method: str) -> Dict[str, torch.Tensor]:
+    return load_checkpoint(newest_checkpoint(only_run(outputs, method) / "nerfstudio_models"))["pipeline"]
+
+
+def assert_same_within(found: Dict[str, torch.Tensor], expected: Dict[str, torch.Tensor], start: Dict, share: float):
+    """Weights differ by less than a share of how far training has moved them, in the root of mean squares."""
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        if value.is_floating_point():
+            moved = (value - start[name]).square().mean().sqrt() if name in start else value.square().mean().sqrt()
+            error = (found[name] - value).square().mean().sqrt()
+            assert error <= share * moved + 1e-7, f"{name}: {error} of {moved}"
+        else:
+            assert torch.equal(found[name], value), name
+
+
+@hard_case(
+    "two processes",
+    case="stage 1 on two processes, by nerfstudio's launch with gloo",
+    could_go_wrong="no start without CUDA; other rays, other jitter, grids that differ; names that no reader knows",
+    must_hold="the weights of one process with the same settings, to 0.1% of what 6 steps have moved them",
+)
+def test_stage_1_on_two_processes_is_stage_1_on_one(llff_scene, tmp_path):
+    still = ["--max-num-iterations", "1", "--optimizers.fields.optimizer.lr", "1e-12"]
+    for name, more in (("one", []), ("two", TWO), ("start", still)):
+        ns_train("coarse-fewshot", llff_scene, tmp_path / name, *TINY, *COMMON, *more)
+    one, two, start = (weights(tmp_path / name, "coarse-fewshot") for name in ("one", "two", "start"))
+    assert_same_within(two, one, start, share=1e-3)
+
+
+@hard_case(
+    "two processes",
+    case="stage 2 on two processes: whole views, rendered in shares, after a warm start",
+    could_go_wrong="gradients of half a picture, or half the gradient; different starts; each process its own view",
+    must_hold="the weights of one process with the same settings, to 0.1% of what 6 steps have moved them",
+)
+def test_stage_2_on_two_processes_is_stage_2_on_one(runs, llff_scene, painting, tmp_path):
+    flags = ["--style-image", str(painting), "--coarse-run", str(runs.coarse), *TINY_STYLE, *COMMON]
+    for name, more in (("one", []), ("two", TWO)):
+        ns_train("hier-style", llff_scene, tmp_path / name, *flags, *more)
+    one, two = (weights(tmp_path / name, "hier-style") for name in ("one", "two"))
+    assert_same_within(two, one, {}, share=1e-3)
+
+
+@hard_case(
+    "two processes",
+    case="bad input to two processes",
+    could_go_wrong="a traceback of the process that started them, or one that waits for the other for ever",
+    must_hold="the sentence, exit status 1, no traceback",
+)
+def test_two_processes_end_with_a_sentence(llff_scene, tmp_path, capfd):
+    with pytest.raises(SystemExit) as ended:
+        ns_train("coarse-fewshot", llff_scene, tmp_path, *TINY, *COMMON, *TWO, "--view-ids", "99")
+    assert ended.value.code == 1
+    printed = capfd.readouterr().err
+    assert "Error: --view-ids names 99" in printed
+    assert "Traceback" not in printed
+
+
+def in_two_processes(target: Any, tmp_path: Path) -> list:
+    """What `target(rank)` returns in each of two processes that can talk to each other."""
+    started = [trial.start(_join, tmp_path / f"log{rank}.txt", target, rank, tmp_path) for rank in (0, 1)]
+    for rank, process in enumerate(started):
+        process.join(timeout=120)
+        assert process.exitcode == 0, (tmp_path / f"log{rank}.txt").read_text()[-3000:]
+    return [torch.load(tmp_path / f"result{rank}.pt") for rank in (0, 1)]
+
+
+def _join(target: Any, rank: int, tmp_path: Path) -> None:
+    dist.init_process_group("gloo", init_method=f"file://{tmp_path}/meeting", world_size=2, rank=rank)
+    torch.save(target(rank), tmp_path / f"result{rank}.pt")
+    dist.destroy_process_group()
+
+
+def _step_with_one_broken_gradient(rank: int) -> torch.Tensor:
+    parameter = nn.Parameter(torch.ones(4))
+    config = {"fields": {"optimizer": FusedAdamConfig(lr=0.1), "scheduler": None}}
+    optimizers = FiniteOptimizers(config, {"fields": [parameter]})
+    seen = []
+    for step in range(3):
+        parameter.grad = torch.full((4,), torch.nan if (rank, step) == (1, 1) else 1.0 + rank)
+        optimizers.optimizer_scaler_step_some(GradScaler("cpu", enabled=False), ["fields"])
+        seen.append(parameter.detach().clone())
+    return torch.stack([*seen, torch.tensor([*map(float, optimizers.skipped()), 0.0, 0.0])])
+
+
+@hard_case(
+    "two processes",
+    case="the gradient isn't finite in one of two processes",
+    could_go_wrong="one skips the step, the other takes it, and they hold different models from then on",
+    must_hold="both skip it, and both take the next",
+)
+def test_a_broken_gradient_in_one_process_skips_the_step_in_all(tmp_path):
+    first, second = in_two_processes(_step_with_one_broken_gradient, tmp_path)
+    assert torch.equal(first, second)
+    assert torch.equal(first[0], first[1])
+    assert (first[2] < first[1]).all()
+    assert first[3].tolist() == [1, 0, 0, 0]
+
+
+def _square_in_shares(rank: int) -> torch.Tensor:
+    weight = nn.Parameter(torch.tensor([2.0, 3.0]))
+    rows = torch.arange(14.0).view(7, 2)
+    own = (processes.own_share(rows) * weight).square()
+    whole = processes.put_together(own, 7)
+    whole.cos().mean().backward()
+    processes.average_gradients([weight])
+    return torch.cat([whole.detach().flatten(), weight.grad])
+
+
+@hard_case(
+    "two processes",
+    case="an odd number of rays on two processes",
+    could_go_wrong="shares of different lengths, a ray that is lost or counted twice, gradients of another scale",
+    must_hold="rows in their order, and the gradient of one process",
+)
+def test_shares_put_together_are_the_whole_with_its_gradient(tmp_path):
+    found = in_two_processes(_square_in_shares, tmp_path)
+    expected = _square_in_shares(0)
+    for part in found:
+        torch.testing.assert_close(part, expected)
+
+
+def test_one_process_gets_back_what_it_gave():
+    values = torch.rand(5, 3)
+    assert processes.own_share(values) is values
+    assert processes.put_together(values, 5) is values
+    assert processes.from_first_process(values) is values
+    assert processes.any_process(True, values.device) is True
