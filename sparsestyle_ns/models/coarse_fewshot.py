@@ -75,7 +75,7 @@ class CoarseFewShotModelConfig(ModelConfig):
     """Share of guided samples, in (0, 1], that is spread evenly."""
     grid_resolution: int = 64
     """Cells along a side of the grid that remembers density."""
-    distortion_weight: float = 0.01
+    distortion_weight: float = 0.015
     """Weight of the distortion loss, which gathers a ray's weight in one place; 0 is off, as in the paper."""
     distortion_start: float = 0.4
     """Share of the iterations after which the distortion loss sets in."""

@@ -44,9 +44,10 @@ def assert_same_within(found: Dict[str, torch.Tensor], expected: Dict[str, torch
     must_hold="the weights of one process with the same settings, to 0.1% of what 6 steps have moved them",
 )
 def test_stage_1_on_two_processes_is_stage_1_on_one(llff_scene, tmp_path):
+    whole = ["--pipeline.model.thinning", "0"]  # else each process draws which of its samples to leave out
     still = ["--max-num-iterations", "1", "--optimizers.fields.optimizer.lr", "1e-12"]
     for name, more in (("one", []), ("two", TWO), ("start", still)):
-        ns_train("coarse-fewshot", llff_scene, tmp_path / name, *TINY, *COMMON, *more)
+        ns_train("coarse-fewshot", llff_scene, tmp_path / name, *TINY, *COMMON, *whole, *more)
     one, two, start = (weights(tmp_path / name, "coarse-fewshot") for name in ("one", "two", "start"))
     assert_same_within(two, one, start, share=1e-3)
 
