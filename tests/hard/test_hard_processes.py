@@ -15,6 +15,7 @@ from torch.amp import GradScaler
 from sparsestyle_ns import processes
 from sparsestyle_ns.coarse_run import load_checkpoint, newest_checkpoint
 from sparsestyle_ns.finite_steps import FiniteOptimizers
+from sparsestyle_ns.run_folder import load_run
 from sparsestyle_ns.trainer import FusedAdamConfig
 
 TWO = ["--machine.num-devices", "2", "--machine.device-type", "cpu"]
@@ -27,21 +28,28 @@ def weights(outputs: Path, method: str) -> Dict[str, torch.Tensor]:
 
 def assert_same_within(found: Dict[str, torch.Tensor], expected: Dict[str, torch.Tensor], start: Dict, share: float):
     """Weights differ by less than a share of how far training has moved them, in the root of mean squares."""
-    assert found.keys() == expected.keys()
+    assert found.keys() == expected.keys() == start.keys()
     for name, value in expected.items():
-        if value.is_floating_point():
-            moved = (value - start[name]).square().mean().sqrt() if name in start else value.square().mean().sqrt()
+        if value.is_floating_point() and value.numel() > 0:
+            moved = (value - start[name]).square().mean().sqrt()
             error = (found[name] - value).square().mean().sqrt()
             assert error <= share * moved + 1e-7, f"{name}: {error} of {moved}"
         else:
             assert torch.equal(found[name], value), name
 
 
+@torch.no_grad()
+def picture(run: Path) -> Dict[str, torch.Tensor]:
+    """The first training view as a run renders it."""
+    _, pipeline, _ = load_run(run / "config.yml")
+    return pipeline.model.get_outputs_for_camera(pipeline.datamanager.train_dataset.cameras[0:1])
+
+
 @hard_case(
     "two processes",
     case="stage 1 on two processes, by nerfstudio's launch with gloo",
     could_go_wrong="no start without CUDA; other rays, other jitter, grids that differ; names that no reader knows",
-    must_hold="the weights of one process with the same settings, to 0.1% of what 6 steps have moved them",
+    must_hold="the weights of one process with the same settings, to 0.01% of what 6 steps have moved them",
 )
 def test_stage_1_on_two_processes_is_stage_1_on_one(llff_scene, tmp_path):
     whole = ["--pipeline.model.thinning", "0"]  # else each process draws which of its samples to leave out
@@ -49,21 +57,24 @@ def test_stage_1_on_two_processes_is_stage_1_on_one(llff_scene, tmp_path):
     for name, more in (("one", []), ("two", TWO), ("start", still)):
         ns_train("coarse-fewshot", llff_scene, tmp_path / name, *TINY, *COMMON, *whole, *more)
     one, two, start = (weights(tmp_path / name, "coarse-fewshot") for name in ("one", "two", "start"))
-    assert_same_within(two, one, start, share=1e-3)
+    assert_same_within(two, one, start, share=1e-4)
 
 
 @hard_case(
     "two processes",
     case="stage 2 on two processes: whole views, rendered in shares, after a warm start",
     could_go_wrong="gradients of half a picture, or half the gradient; different starts; each process its own view",
-    must_hold="the weights of one process with the same settings, to 0.1% of what 6 steps have moved them",
+    must_hold="the picture of one process with the same settings, to 1% of what stylising has changed in it",
 )
 def test_stage_2_on_two_processes_is_stage_2_on_one(runs, llff_scene, painting, tmp_path):
+    # Weights alone say less: Adam moves one whose gradient is only rounding by as much as any other.
     flags = ["--style-image", str(painting), "--coarse-run", str(runs.coarse), *TINY_STYLE, *COMMON]
     for name, more in (("one", []), ("two", TWO)):
         ns_train("hier-style", llff_scene, tmp_path / name, *flags, *more)
-    one, two = (weights(tmp_path / name, "hier-style") for name in ("one", "two"))
-    assert_same_within(two, one, {}, share=1e-3)
+    one, two = (picture(only_run(tmp_path / name, "hier-style")) for name in ("one", "two"))
+    error = (two["rgb"] - one["rgb"]).square().mean().sqrt()
+    changed = (one["rgb"] - one["rgb_coarse"]).square().mean().sqrt()
+    assert error <= 0.01 * changed, f"{error} of {changed}"
 
 
 @hard_case(
