@@ -6,7 +6,7 @@ import signal
 import warnings
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Dict, List, Literal, Tuple, Type
+from typing import Any, Dict, List, Literal, Optional, Tuple, Type
 
 import numpy as np
 import torch
@@ -18,8 +18,12 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sparsestyle_ns.coarse_run import CoarseRun, check_scene, find_coarse_run, newest_checkpoint, read_coarse_run
+from sparsestyle_ns.datamanager import FewShotDataManager
+from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.errors import InputError, exit_on_input_error
-from sparsestyle_ns.scene_record import SceneRecord, record_scene
+from sparsestyle_ns.scene_record import record_scene
+from sparsestyle_ns.style.image import load_style_image
 
 
 def this_machine() -> MachineConfig:
@@ -66,13 +70,43 @@ class SparseStyleTrainer(Trainer):
 
     config: SparseStyleTrainerConfig
 
+    def __init__(self, config: SparseStyleTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        super().__init__(config, local_rank, world_size)
+        self._total = config.max_num_iterations
+
     @exit_on_input_error
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Sets up the run and records what it is trained on."""
+        """Sets up the run and records what it is trained on, and which effects are simulated."""
+        checkpoint = self.resumed_checkpoint()
+        if checkpoint is not None:
+            self.config.pipeline.decided = read_decisions(checkpoint, self.config.pipeline.effects)
         super().setup(test_mode)
         record_scene(self.pipeline.datamanager).save(self.base_dir)
+        self.save_decisions()
 
-    def _load_checkpoint(self) -> None:
+    def save_decisions(self) -> None:
+        """Writes which effects are simulated into effects.json, and into config.yml, from which a run is loaded."""
+        self.pipeline.effects.save(self.base_dir)
+        self._saved_decisions = self.pipeline.effects
+        iterations, self.config.max_num_iterations = self.config.max_num_iterations, self._total
+        self.config.save_config()
+        self.config.max_num_iterations = iterations
+
+    def resumed_checkpoint(self) -> Optional[Path]:
+        """The checkpoint that training goes on from; None for a new run.
+
+        Raises:
+            InputError: there is none where the command line says.
+        """
+        self._check_sources()
+        config = self.config
+        if config.load_dir is None:
+            return config.load_checkpoint
+        if config.load_step is None:
+            return newest_checkpoint(config.load_dir)
+        return config.load_dir / f"step-{config.load_step:09d}.ckpt"
+
+    def _check_sources(self) -> None:
         for source in (self.config.load_dir, self.config.load_checkpoint):
             if source is not None and not source.exists():
                 raise InputError(
@@ -82,7 +116,6 @@ class SparseStyleTrainer(Trainer):
             raise InputError(
                 f"There is no checkpoint in {self.config.load_dir}; name a run's nerfstudio_models folder."
             )
-        super()._load_checkpoint()
 
     @exit_on_input_error
     def train(self) -> None:
@@ -90,7 +123,7 @@ class SparseStyleTrainer(Trainer):
 
         Ctrl-C ends training after the iteration that is under way and saves a checkpoint; a second one stops at once.
         """
-        total = self.config.max_num_iterations
+        total = self._total
         if self._start_step >= total:
             raise InputError(
                 f"The checkpoint is of iteration {self._start_step}, and --max-num-iterations is {total}; raise it to "
@@ -141,7 +174,7 @@ class SparseStyleTrainer(Trainer):
 
     def notes(self) -> Dict[str, Any]:
         """What a checkpoint says beside the state: numbers and words only."""
-        return {}
+        return {"effects": self.pipeline.effects.records()}
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
@@ -163,6 +196,24 @@ class SparseStyleTrainer(Trainer):
             for path in self.checkpoint_dir.glob("*.ckpt"):
                 if path != target:
                     path.unlink()
+        if self.pipeline.effects != self._saved_decisions:
+            self.save_decisions()
+
+
+def read_decisions(checkpoint: Path, settings: Any) -> Optional[Decisions]:
+    """Which effects a checkpoint was made with; None where it doesn't say.
+
+    Raises:
+        InputError: the settings ask for others.
+    """
+    if not checkpoint.is_file():
+        return None  # nerfstudio says so
+    records = torch.load(checkpoint, map_location="cpu", weights_only=True).get("effects")
+    if records is None:
+        return None
+    decisions = Decisions.from_records(records)
+    decisions.check_choices(settings, f"the checkpoint {checkpoint}")
+    return decisions
 
 
 def without_numpy_scalars(value: Any) -> Any:
@@ -214,9 +265,11 @@ class HierStyleTrainer(SparseStyleTrainer):
         self.config.pipeline.check_style()
         run = None
         if self.config.load_dir is None and self.config.load_checkpoint is None:
-            run = self.coarse_run()
+            manager = self._photos()
+            run = self.coarse_run(manager)
             self.config.pipeline.coarse_run = run.folder.resolve()
             self.config.pipeline.model.coarse_field = copy.deepcopy(run.config.pipeline.model.coarse_field)
+            self.config.pipeline.decided = self._decide(manager, run)
         else:
             self._adopt_shape_of_checkpoint()
         self._coarse_state = None if run is None else run.model_state()
@@ -226,7 +279,7 @@ class HierStyleTrainer(SparseStyleTrainer):
 
     def notes(self) -> Dict[str, Any]:
         """Which feature network stylised the scene, and where its weights came from."""
-        return {"backbone": asdict(self.pipeline.targets.backbone.description)}
+        return {**super().notes(), "backbone": asdict(self.pipeline.targets.backbone.description)}
 
     def _load_checkpoint(self) -> None:
         super()._load_checkpoint()
@@ -238,20 +291,23 @@ class HierStyleTrainer(SparseStyleTrainer):
         """Takes the coarse field's settings from the run that is resumed; they came from its coarse run."""
         import yaml
 
-        folder = self.config.load_dir or self.config.load_checkpoint.parent
-        path = folder.parent / "config.yml"
+        checkpoint = self.resumed_checkpoint()
+        path = checkpoint.parent.parent / "config.yml"
         if path.is_file():
             saved = yaml.load(path.read_text(), Loader=yaml.Loader)
             self.config.pipeline.model.coarse_field = saved.pipeline.model.coarse_field
             self.config.pipeline.coarse_run = saved.pipeline.coarse_run
 
-    def coarse_run(self) -> CoarseRun:
+    def coarse_run(self, manager: FewShotDataManager) -> CoarseRun:
         """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now.
+
+        Args:
+            manager: the photos, with what was decided about them.
 
         Raises:
             InputError: the run that was asked for doesn't exist or is of another scene.
         """
-        scene = self._scene()
+        scene = record_scene(manager)
         asked = self.config.pipeline.coarse_run
         if asked is not None:
             run = read_coarse_run(asked)
@@ -265,13 +321,21 @@ class HierStyleTrainer(SparseStyleTrainer):
             CONSOLE.print(f"Stylising the newest coarse run of this scene, {found.folder}.")
             return found
         CONSOLE.print("There is no finished coarse run of this scene and these views; training one first.")
-        return self._train_coarse(methods[-1])
+        return self._train_coarse(methods[-1], manager.effects)
 
-    def _scene(self) -> SceneRecord:
+    def _photos(self) -> FewShotDataManager:
         config = copy.deepcopy(self.config.pipeline.datamanager)
-        return record_scene(config.setup(device="cpu", test_mode="inference"))
+        config.effects = self.config.pipeline.effects
+        return config.setup(device="cpu", test_mode="inference")
 
-    def _train_coarse(self, method: str) -> CoarseRun:
+    def _decide(self, manager: FewShotDataManager, run: CoarseRun) -> Decisions:
+        """What is simulated: as in the coarse run, and the rest by its field and the painting."""
+        settings, scene = self.config.pipeline, manager.scene
+        scene.coarse_density = run.density(manager.effects)
+        scene.style_image = load_style_image(settings.style_image)
+        return decide(scene, settings.effects, manager.effects)
+
+    def _train_coarse(self, method: str, decided: Decisions) -> CoarseRun:
         from sparsestyle_ns.method_configs import method_config
 
         config: TrainerConfig = copy.deepcopy(method_config(method))
@@ -286,6 +350,7 @@ class HierStyleTrainer(SparseStyleTrainer):
             "camera_res_scale_factor",
         ):
             setattr(config.pipeline.datamanager, name, copy.deepcopy(ours[name]))
+        config.pipeline.effects, config.pipeline.decided = self.config.pipeline.effects, decided
         config.data, config.output_dir = self.config.data, self.config.output_dir
         config.experiment_name, config.project_name = self.config.experiment_name, self.config.project_name
         config.machine, config.logging = self.config.machine, self.config.logging
