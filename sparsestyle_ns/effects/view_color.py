@@ -12,7 +12,7 @@ MIN_VIEWS = 6
 """Photos below which shine can't be told from shape (README, Where we depart from the paper)."""
 NOISE = 0.05
 """Difference of matched colours, of a range of 1, that noise and inexact matches explain."""
-MIN_SHARE = 0.1
+MIN_SHARE = 0.08
 """Share of matched points that differ by more, from which on colour depends on the view."""
 
 

@@ -109,7 +109,7 @@ class CoarseFewShotModel(Model):
     def build_grid(self, effects: Decisions) -> None:
         """Makes the grid that guides samples, or takes it away, as is decided; a new one knows nothing yet."""
         grid = effects.build("empty_space", grid=DensityGrid, resolution=self.config.grid_resolution)
-        self.grid = None if grid is None else grid.to(self.device)
+        self.grid = None if grid is None else grid.to(next(self.field.parameters()).device)
 
     def get_param_groups(self) -> Dict[str, List[Parameter]]:
         """One group, `fields`: the field, and the photos' exposures where they are learned."""
