@@ -43,7 +43,7 @@ else
 endif
 
 bench: $(READY)
-	set -e; for name in hash_grid nnfm stage2_step render memory scaling stage1; do \
+	set -e; for name in hash_grid nnfm stage2_step render memory scaling effects stage1; do \
 	    $(BIN)/python -m benchmarks.$$name $(BENCH); \
 	done
 	$(BIN)/python -m benchmarks.summary $(BENCH)

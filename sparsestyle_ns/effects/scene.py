@@ -17,11 +17,15 @@ from PIL import Image
 from torch import Tensor
 
 from sparsestyle_ns.effects.matches import ColorMatches, match_colors
+from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.view_selection import evenly_spaced
 
 LONGEST_SIDE = 504
 """Pixels along the longer side at which photos are looked at."""
 BORDER = 0.02
 """Width of a photo's border, as a part of its longer side; at least one pixel."""
+MATCHED_VIEWS = 24
+"""Photos among which points are matched; more would cost minutes and say the same."""
 SAME_COLOR = 6 / 255
 """How far border pixels may lie from their median, in each channel, to count as one colour."""
 
@@ -101,16 +105,24 @@ class Scene:
 
     @cached_property
     def matches(self) -> ColorMatches:
-        """Points that are seen in two photos, with their colours there."""
-        return match_colors(self.photos, self.cameras)
+        """Points that are seen in two photos, with their colours there; of at most `MATCHED_VIEWS`, evenly spaced."""
+        chosen = evenly_spaced(self.num_views, MATCHED_VIEWS)
+        return match_colors([self.photos[index] for index in chosen], self.cameras[torch.tensor(chosen)])
 
 
 def read_rgba(path: Path) -> Float[np.ndarray, "H W 4"]:
-    """A photo, reduced to `LONGEST_SIDE`."""
-    with Image.open(path) as image:
-        image = image.convert("RGBA")
-        image.thumbnail((LONGEST_SIDE, LONGEST_SIDE), Image.Resampling.BOX)
-        return np.asarray(image, dtype=np.float32) / 255.0
+    """A photo, reduced to `LONGEST_SIDE`.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    try:
+        with Image.open(path) as image:
+            image = image.convert("RGBA")
+    except OSError as error:  # also what Pillow raises for what isn't a picture
+        raise InputError(f"The photo {path} can't be read ({error}); replace it, or choose other views.") from error
+    image.thumbnail((LONGEST_SIDE, LONGEST_SIDE), Image.Resampling.BOX)
+    return np.asarray(image, dtype=np.float32) / 255.0
 
 
 def border(photo: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "pixels C"]:

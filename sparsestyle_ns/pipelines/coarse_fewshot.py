@@ -38,9 +38,12 @@ class CoarseFewShotPipeline(CheckedPipeline):
         return callbacks
 
     def decide_empty_space(self, step: int) -> None:
-        """After half of the iterations and then after every tenth, measures whether skipping empty space pays."""
-        done, tenth = step + 1, max(1, self.model.num_steps // 10)
-        if done % tenth or not self.model.num_steps <= 2 * done < 2 * self.model.num_steps:
+        """After every tenth of the iterations from three quarters on, measures whether skipping empty space pays.
+
+        Before, the field is still half the fog that it starts as, and a measurement would say so.
+        """
+        done, total = step + 1, self.model.num_steps
+        if done % max(1, total // 10) or not 3 * total <= 4 * done < 4 * total:
             return
         scene = self.datamanager.scene
         scene.coarse_density = lambda points: self.model.field.density_and_feature(points.to(self.device))[0]
