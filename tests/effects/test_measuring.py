@@ -47,8 +47,8 @@ def test_a_true_match_obeys_the_cameras_and_a_shifted_one_is_off_by_the_shift():
     first, second = seen(poses[0]), seen(poses[1])
     assert epipolar_error(first, second, *poses) == pytest.approx(np.zeros(20), abs=1e-9)
     # Beside each other, cameras allow any shift sideways and none upwards; Sampson shares it between both photos.
-    assert epipolar_error(first, second + [0.1, 0, 0], *poses) == pytest.approx(np.zeros(20), abs=1e-9)
-    assert epipolar_error(first, second + [0, 0.1, 0], *poses) == pytest.approx(np.full(20, 0.1 / np.sqrt(2)))
+    assert epipolar_error(first, second + np.array([0.1, 0, 0]), *poses) == pytest.approx(np.zeros(20), abs=1e-9)
+    assert epipolar_error(first, second + np.array([0, 0.1, 0]), *poses) == pytest.approx(np.full(20, 0.1 / np.sqrt(2)))
 
 
 def test_only_the_nearest_neighbours_of_each_other_match_and_only_where_they_stand_out():
