@@ -117,12 +117,14 @@ def find_keypoints(photo: Float[np.ndarray, "H W 4"], cameras: Cameras, index: i
 
 
 def undistorted(points: Float[np.ndarray, "points 2"], cameras: Cameras, index: int) -> Float[np.ndarray, "points 2"]:
-    """Image points over the focal length, freed from the lens's distortion (OpenCV's radial-tangential model)."""
+    """Image points over the focal length, freed from the lens's distortion.
+
+    OpenCV's radial-tangential model with k1, k2, k3, p1 and p2; nerfstudio's k4 has no place in it.
+    """
     if cameras.distortion_params is None:
         return points
-    k1, k2, k3, k4, p1, p2 = cameras.distortion_params[index].double().tolist()
-    coefficients = np.array([k1, k2, p1, p2, k3]) if k4 == 0 else np.array([k1, k2, p1, p2, k3, 0.0, 0.0, 0.0])
-    return cv2.undistortPoints(points[:, None], np.eye(3), coefficients)[:, 0]
+    k1, k2, k3, _, p1, p2 = cameras.distortion_params[index].double().tolist()
+    return cv2.undistortPoints(points[:, None], np.eye(3), np.array([k1, k2, p1, p2, k3]))[:, 0]
 
 
 def mutual_matches(

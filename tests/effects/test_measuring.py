@@ -59,8 +59,9 @@ def test_only_the_nearest_neighbours_of_each_other_match_and_only_where_they_sta
 
 
 def test_colours_are_sampled_at_pixel_centres_and_between_them():
-    image = np.arange(12, dtype=np.float32).reshape(3, 4, 1)
-    assert sample(image, np.array([[1.0, 2.0], [1.5, 0.0], [0.0, 0.5]]))[:, 0].tolist() == [9.0, 1.5, 2.0]
+    image = np.arange(12, dtype=np.float32).reshape(3, 4)[..., None] * np.array([1, 10], dtype=np.float32)
+    found = sample(image, np.array([[1.0, 2.0], [1.5, 0.0], [0.0, 0.5]]))
+    assert found.tolist() == [[9.0, 90.0], [1.5, 15.0], [2.0, 20.0]]
 
 
 def colour_matches(gains, outliers: int = 0) -> ColorMatches:
