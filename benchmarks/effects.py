@@ -10,6 +10,7 @@ import copy
 import dataclasses
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Callable, Dict, Tuple
 
@@ -132,12 +133,27 @@ def residual_density(report: Report) -> Dict[str, Measure]:
     return {"with": contender(True), "without": contender(False)}
 
 
+@dataclass
+class EffectOptions(Options):
+    """What this benchmark takes."""
+
+    only: Tuple[str, ...] = ()
+    """Effects to time, by name; all where left out."""
+
+
 @exit_on_input_error
-def main(options: Options) -> None:
-    """Measures all effects, in the order of their table."""
+def main(options: EffectOptions) -> None:
+    """Measures the effects, in the order of their table.
+
+    Raises:
+        InputError: there is no such effect.
+    """
+    unknown = set(options.only) - EFFECTS.keys()
+    if unknown:
+        raise InputError(f"--only names {', '.join(sorted(unknown))}; the effects are {', '.join(EFFECTS)}.")
     report = Report("effects", options)
     special = {"lens_distortion": lens_distortion, "residual_density": residual_density, "palette": palette}
-    for name in EFFECTS:
+    for name in options.only or EFFECTS:
         print(name, flush=True)
         measures = special[name](report) if name in special else stage_1(name, report)
         found = report.measure(name, measures, options.repetitions(20))
@@ -153,4 +169,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    main(tyro.cli(EffectOptions, description=__doc__))

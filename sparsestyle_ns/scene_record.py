@@ -59,9 +59,8 @@ class SceneRecord:
         for name, on in self.effects.items():
             if on != other.effects.get(name):
                 word = "on" if other.effects.get(name) else "off"
-                return (
-                    f"it has the effect {name} {word}, which --pipeline.effects.{name.replace('_', '-')} {word} gives"
-                )
+                flag = f"--pipeline.effects.{name.replace('_', '-')} {word}"
+                return f"it was made with the effect {name} {word}, as by {flag}"
         if self.background_color != other.background_color:
             return f"its background has the colour {other.background_color} in place of {self.background_color}"
         mine, theirs = [*self.cameras, self.scene_box], [*other.cameras, other.scene_box]
