@@ -18,6 +18,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from benchmarks._measure import Duration, Measure, Options, Report, ratio_of_pairs, timed
 from benchmarks._scene import COARSE_METHOD, Scene, Training, at_size, find_scene, load_photos
+from sparsestyle_ns.effects.registry import EffectSettings
 from sparsestyle_ns.errors import InputError, exit_on_input_error
 from sparsestyle_ns.evaluation.image_metrics import psnr
 from sparsestyle_ns.method_configs import method_config
@@ -99,8 +100,8 @@ def our_config(scene: Scene, options: Stage1Options) -> Any:
 def even_config(scene: Scene, options: Stage1Options) -> Any:
     """The same with even samples on every ray, as NeRF's first pass."""
     config = our_config(scene, options)
-    model = config.pipeline.model
-    model.sampling, model.num_samples = "even", EVEN_SAMPLES
+    config.pipeline.effects = EffectSettings(empty_space="off")
+    config.pipeline.model.num_samples = EVEN_SAMPLES
     return config
 
 

@@ -1,20 +1,24 @@
 """Renders a sample scene, so that everything can be tried without downloading anything.
 
-A small ray tracer draws balls, boxes and columns with painted surfaces, in the two layouts the field uses:
+A small ray tracer draws balls, boxes and columns with painted surfaces, in the layouts the field uses:
 
     python data_scripts/make_sample_scene.py OUTPUT                      # OUTPUT/llff and OUTPUT/blender
     python data_scripts/make_sample_scene.py OUTPUT --layout llff --width 504
     python data_scripts/make_sample_scene.py OUTPUT --layout blender --num-train 40
+    python data_scripts/make_sample_scene.py OUTPUT --layout nerfstudio --distortion 0.1
+    python data_scripts/make_sample_scene.py OUTPUT --layout llff --shiny 0.6 --exposure 0.5
 
 `OUTPUT/llff` holds `images/image000.png`, ... and `poses_bounds.npy`: forward-facing photos of a still life in a room.
 `OUTPUT/blender` holds `train`, `val` and `test` folders of RGBA pictures and `transforms_*.json`: objects on a plinth
-seen from all around. The same seed gives the same files.
+seen from all around. `OUTPUT/nerfstudio` holds `images` and `transforms.json`: the same objects from all around, on a
+ground with things far away behind them. The same seed gives the same files.
 
 Conventions: world coordinates are right-handed with z up. A camera looks along its own -z, with x to the right and
 y up, and a camera-to-world matrix maps its coordinates to the world's. The centre of the pixel in row i and column j
 is at (j + 0.5, i + 0.5), and the principal point is at (width / 2, height / 2). Inside the tracer, points, directions
-and colours are float32 arrays with the component first, (3, N). Surfaces are matt: what a point looks like does not
-depend on who looks, so a point seen by two cameras has the same colour in both pictures.
+and colours are float32 arrays with the component first, (3, N). Surfaces are matt, unless they are made shiny: what a
+point looks like does not depend on who looks, so a point seen by two cameras has the same colour in both pictures,
+unless they are exposed differently.
 """
 
 import argparse
@@ -490,13 +494,20 @@ class Scene:
     """Share of a surface's colour that the sun adds where it shines straight on it."""
     backdrop: tuple[Shape, ...] = ()
     """Floors and walls: seen like the shapes, but nothing that is seen lies in their shadow."""
+    shine: float = 0.0
+    """Brightness of a lamp's reflection where it is seen straight: what makes colour depend on who looks."""
+    lamp: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction towards that lamp, which does nothing else; any length."""
+    polish: float = 40.0
+    """Exponent of that reflection: how narrow it is."""
 
 
-def still_life(seed: int = 0) -> Scene:
+def still_life(seed: int = 0, shine: float = 0.0) -> Scene:
     """The forward-facing scene: toys in front of a wall, z up, to be seen from around (0, 0, 1.25) along +y.
 
     Args:
         seed: Which noise the textures show; the shapes stay where they are.
+        shine: See `Scene`.
     """
     crate_half, cube_half, picture_half = (0.52, 0.52, 0.52), (0.3, 0.3, 0.3), (0.95, 0.05, 0.68)
     backdrop = (
@@ -518,14 +529,17 @@ def still_life(seed: int = 0) -> Scene:
         Cylinder((-2.2, 4.9, 0.55), 0.5, 0.55, lambda p, n: drum(p, n, 0.55)),
         Cylinder((1.12, 2.5, 0.17), 0.26, 0.17, lambda p, n: drum(p, n, 0.17)),
     )
-    return Scene(shapes, ValueNoise(seed), sun=(-0.62, -0.75, 1.0), backdrop=backdrop)
+    sun, lamp = (-0.62, -0.75, 1.0), (-0.1, -1.0, 0.1)
+    return Scene(shapes, ValueNoise(seed), sun=sun, backdrop=backdrop, shine=shine, lamp=lamp)
 
 
-def objects_on_a_plinth(seed: int = 0) -> Scene:
-    """The all-around scene: toys on a round plinth within [-1, 1]^3, z up, nothing behind them.
+def objects_on_a_plinth(seed: int = 0, shine: float = 0.0, landscape: bool = False) -> Scene:
+    """The all-around scene: toys on a round plinth within [-1, 1]^3, z up.
 
     Args:
         seed: Which noise the textures show; the shapes stay where they are.
+        shine: See `Scene`.
+        landscape: Whether they stand on a ground, with walls and balls far behind them; else there is nothing.
     """
     crate_half, cube_half = (0.27, 0.27, 0.27), (0.15, 0.15, 0.15)
     shapes = (
@@ -539,7 +553,25 @@ def objects_on_a_plinth(seed: int = 0) -> Scene:
         Cylinder((0.02, -0.68, -0.40), 0.14, 0.09, lambda p, n: drum(p, n, 0.09)),
         Sphere((0.62, 0.34, -0.36), 0.13, lambda p, n: globe_checker(p, n, "#d7263d", "#fbf3e4", 5)),
     )
-    return Scene(shapes, ValueNoise(seed), sun=(-0.5, -0.7, 1.2), sky_light=0.7, sun_light=0.56)
+    backdrop = far_away() if landscape else ()
+    sun = (-0.5, -0.7, 1.2)
+    return Scene(shapes, ValueNoise(seed), sun=sun, sky_light=0.7, sun_light=0.56, backdrop=backdrop, shine=shine)
+
+
+def far_away() -> tuple[Shape, ...]:
+    """A ground 0.61 below the origin, walls 14 away from it on all sides, and eight balls half way."""
+    walls = [
+        Box((0, 14, 5), (15, 0.1, 6), lambda p, n: painted_bricks(p * 0.35, n, height_of_centre=2)),
+        Box((0, -14, 5), (15, 0.1, 6), lambda p, n: painted_bricks(p * 0.35, n, height_of_centre=2)),
+        Box((14, 0, 5), (0.1, 15, 6), lambda p, n: painted_bricks(p[[1, 0, 2]] * 0.35, n, height_of_centre=2)),
+        Box((-14, 0, 5), (0.1, 15, 6), lambda p, n: painted_bricks(p[[1, 0, 2]] * 0.35, n, height_of_centre=2)),
+    ]
+    balls = []
+    for i in range(8):
+        angle, radius = 2 * math.pi * i / 8, 1.0 + 0.25 * (i % 3)
+        centre = (7 * math.cos(angle), 7 * math.sin(angle), radius - 0.61)
+        balls.append(Sphere(centre, radius, (beach_ball, planet)[i % 2]))
+    return (Box((0, 0, -0.66), (15, 15, 0.05), lambda p, n: floor_boards(p * 0.5, n)), *walls, *balls)
 
 
 # ------------------------------------------------------------------------------------------------------ rendering
@@ -552,6 +584,7 @@ def render_sample(
     width: int,
     scene: Optional[Scene] = None,
     supersample: int = 3,
+    distortion: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Renders one view, with the depth and coverage that are true of it.
 
@@ -562,6 +595,7 @@ def render_sample(
         width: Columns of the picture.
         scene: What to look at; None for `still_life()`.
         supersample: Rays along each side of a pixel; odd, so that one of them passes through the pixel's centre.
+        distortion: k1 of the lens: a point at distance r from the axis, over the focal length, is seen at r + k1 r^3.
 
     Returns:
         rgb (height, width, 3) in [0, 1], the mean colour of what a pixel sees of objects, not multiplied by alpha and
@@ -583,7 +617,7 @@ def render_sample(
     rows_per_band = max(1, RAYS_PER_BAND // (width * samples))
     for top in range(0, height, rows_per_band):
         rows = np.arange(top, min(top + rows_per_band, height))
-        directions, cosines = _band_of_rays(pose, focal, height, width, rows, supersample)
+        directions, cosines = _band_of_rays(pose, focal, height, width, rows, supersample, distortion)
         colours, distances = _trace(scene, pose[:, 3][:3, None], directions, samples)
         shape = (len(rows), width, samples)
         is_hit = np.isfinite(distances).reshape(shape)
@@ -595,7 +629,13 @@ def render_sample(
 
 
 def _band_of_rays(
-    pose: np.ndarray, focal: float, height: int, width: int, rows: np.ndarray, supersample: int
+    pose: np.ndarray,
+    focal: float,
+    height: int,
+    width: int,
+    rows: np.ndarray,
+    supersample: int,
+    distortion: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Unit directions (3, N) of the rays of some rows and their cosines (N,) with the viewing axis.
 
@@ -607,9 +647,21 @@ def _band_of_rays(
     shape = (len(rows), width, supersample, supersample)
     x = np.broadcast_to(x[None, :, None, :], shape).reshape(-1).astype(np.float32)
     y = np.broadcast_to(y[:, None, :, None], shape).reshape(-1).astype(np.float32)
+    if distortion != 0:
+        seen = np.hypot(x, y)
+        factor = _undistorted_radius(seen, distortion) / np.maximum(seen, np.float32(1e-9))
+        x, y = x * factor, y * factor
     cosines = 1 / np.sqrt(x * x + y * y + 1)
     directions = pose[:3, :3] @ np.stack([x * cosines, y * cosines, -cosines])
     return directions, cosines
+
+
+def _undistorted_radius(seen: np.ndarray, distortion: float) -> np.ndarray:
+    """r where r + k1 r^3 = `seen`, by Newton's method; finds it where the left side grows with r."""
+    radius = seen.copy()
+    for _ in range(10):
+        radius -= (radius + distortion * radius**3 - seen) / (1 + 3 * distortion * radius**2)
+    return radius
 
 
 def _trace(scene: Scene, origin: np.ndarray, directions: np.ndarray, samples: int) -> tuple[np.ndarray, np.ndarray]:
@@ -632,8 +684,18 @@ def _trace(scene: Scene, origin: np.ndarray, directions: np.ndarray, samples: in
         albedo[:, mask] = shapes[i].texture(local, scene.noise)
 
     colours = np.zeros_like(directions)
-    colours[:, hits] = np.clip(albedo * _light(scene, points, normals, hits % samples, samples), 0, 1)
+    shaded = albedo * _light(scene, points, normals, hits % samples, samples)
+    if scene.shine > 0:
+        shaded += _gloss(scene, normals, directions[:, hits])
+    colours[:, hits] = np.clip(shaded, 0, 1)
     return colours, nearest
+
+
+def _gloss(scene: Scene, normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """The lamp's reflection (N,) on surfaces with these normals (3, N), seen along these directions (Phong)."""
+    mirrored = directions - 2 * _dot(normals, directions) * normals
+    lamp = (np.array(scene.lamp, np.float32) / np.float32(np.linalg.norm(scene.lamp)))[:, None]
+    return np.float32(scene.shine) * np.maximum(_dot(mirrored, lamp), 0) ** np.float32(scene.polish)
 
 
 def _distances(shape: Shape, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -798,6 +860,8 @@ def write_llff(
     height: Optional[int] = None,
     supersample: int = 3,
     seed: int = 0,
+    exposure: float = 0.0,
+    shine: float = 0.0,
 ) -> None:
     """Writes `images/image000.png`, ... and `poses_bounds.npy` of `still_life` into `folder`.
 
@@ -808,15 +872,19 @@ def write_llff(
         height: Their rows; None for three quarters of the columns.
         supersample: Rays along each side of a pixel.
         seed: Which noise and which jitter of the cameras.
+        exposure: Stops by which photos differ; see `photo_gains`. Every eighth, which is held out, has a gain of 1.
+        shine: See `Scene`.
     """
     height = round(width * 0.75) if height is None else height
     focal = LLFF_FOCAL_PER_WIDTH * width
-    scene = still_life(seed)
+    scene = still_life(seed, shine)
+    held_out = [i for i in range(num_views) if i % 8 == 0 and num_views > 8]
+    gains = photo_gains(num_views, exposure, held_out, seed)
     (folder / "images").mkdir()
     rows = []
     for i, pose in enumerate(forward_facing_cameras(num_views, seed=seed)):
         rgb, _, depth = render_sample(pose, focal, height, width, scene, supersample)
-        imageio.imwrite(folder / "images" / f"image{i:03d}.png", _to_bytes(rgb))
+        imageio.imwrite(folder / "images" / f"image{i:03d}.png", _to_bytes(rgb * gains[i]))
         seen = depth[np.isfinite(depth)]
         rows.append(poses_bounds_row(pose, height, width, focal, 0.9 * seen.min(), seen.max()))
         _report_progress("llff", i + 1, num_views)
@@ -831,6 +899,8 @@ def write_blender(
     width: int = 100,
     supersample: int = 3,
     seed: int = 0,
+    exposure: float = 0.0,
+    shine: float = 0.0,
 ) -> None:
     """Writes `train`, `val` and `test` pictures and `transforms_*.json` of `objects_on_a_plinth` into `folder`.
 
@@ -840,6 +910,8 @@ def write_blender(
         width: Columns of the square pictures.
         supersample: Rays along each side of a pixel.
         seed: Which noise and which cameras.
+        exposure: Stops by which training pictures differ; see `photo_gains`.
+        shine: See `Scene`.
     """
     rng = np.random.default_rng(seed)
     splits = {
@@ -847,8 +919,9 @@ def write_blender(
         "val": surrounding_cameras(num_val, rng) if num_val else (),
         "test": circling_cameras(num_test) if num_test else (),
     }
-    scene = objects_on_a_plinth(seed)
+    scene = objects_on_a_plinth(seed, shine)
     focal = 0.5 * width / math.tan(0.5 * BLENDER_CAMERA_ANGLE_X)
+    gains = photo_gains(num_train, exposure, (), seed)
     for split, poses in splits.items():
         if len(poses) == 0:
             continue
@@ -856,12 +929,82 @@ def write_blender(
         frames = []
         for i, pose in enumerate(poses):
             rgb, alpha, _ = render_sample(pose, focal, width, width, scene, supersample)
+            rgb = rgb * gains[i] if split == "train" else rgb
             imageio.imwrite(folder / split / f"r_{i}.png", _to_bytes(np.dstack([rgb, alpha])))
             frame = {"file_path": f"./{split}/r_{i}", "rotation": 2 * math.pi / len(poses)}
             frames.append({**frame, "transform_matrix": pose.tolist()})
             _report_progress(f"blender {split}", i + 1, len(poses))
         transforms = {"camera_angle_x": BLENDER_CAMERA_ANGLE_X, "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(transforms, indent=2))
+
+
+def write_nerfstudio(
+    folder: Path,
+    num_views: int = 20,
+    width: int = 252,
+    height: Optional[int] = None,
+    supersample: int = 3,
+    seed: int = 0,
+    exposure: float = 0.0,
+    shine: float = 0.0,
+    distortion: float = 0.0,
+) -> None:
+    """Writes `images` and `transforms.json` of `objects_on_a_plinth` in a landscape into `folder`.
+
+    Every eighth view is held out, for validation and test alike; the file says so.
+
+    Args:
+        folder: An existing folder.
+        num_views: How many pictures, on a ring around the objects that goes up and down.
+        width: Their columns.
+        height: Their rows; None for three quarters of the columns.
+        supersample: Rays along each side of a pixel.
+        seed: Which noise.
+        exposure: Stops by which training pictures differ; see `photo_gains`.
+        shine: See `Scene`.
+        distortion: k1 of the lens; see `render_sample`.
+    """
+    height = round(width * 0.75) if height is None else height
+    focal = LLFF_FOCAL_PER_WIDTH * width
+    scene = objects_on_a_plinth(seed, shine, landscape=True)
+    names = [f"images/image{i:03d}.png" for i in range(num_views)]
+    held_out = [i for i in range(num_views) if i % 8 == 0 and num_views > 8]
+    gains = photo_gains(num_views, exposure, held_out, seed)
+    (folder / "images").mkdir()
+    frames = []
+    for i, name in enumerate(names):
+        angle = 2 * math.pi * i / num_views
+        flat, height_above = 2.6, 1.0 + 0.5 * math.sin(3 * angle)
+        pose = look_at((flat * math.cos(angle), flat * math.sin(angle), height_above), (0, 0, -0.1))
+        rgb, _, _ = render_sample(pose, focal, height, width, scene, supersample, distortion)
+        imageio.imwrite(folder / name, _to_bytes(rgb * gains[i]))
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+        _report_progress("nerfstudio", i + 1, num_views)
+    camera = {"camera_model": "OPENCV", "fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2}
+    lens = {"k1": distortion, "k2": 0.0, "p1": 0.0, "p2": 0.0} if distortion else {}
+    test = [names[i] for i in held_out] or names
+    splits = {"train_filenames": [name for i, name in enumerate(names) if i not in held_out]}
+    splits |= {"val_filenames": test, "test_filenames": test}
+    content = {**camera, "w": width, "h": height, **lens, **splits, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content, indent=2))
+
+
+def photo_gains(count: int, stops: float, neutral: Sequence[int], seed: int = 0) -> np.ndarray:
+    """Gains (count, 3) that photos of different exposure and white balance have.
+
+    Args:
+        count: How many photos.
+        stops: Largest difference from the mean exposure; a third as much between the channels.
+        neutral: Photos whose gain is 1. The geometric mean of the others is 1 in every channel.
+        seed: Which gains.
+    """
+    rng = np.random.default_rng([seed, 1])
+    logs = rng.uniform(-1, 1, (count, 1)) + rng.uniform(-1, 1, (count, 3)) / 3
+    exposed = np.setdiff1d(np.arange(count), neutral)
+    logs[exposed] -= logs[exposed].mean(axis=0)
+    logs[exposed] /= max(np.abs(logs[exposed]).max(initial=0.0), 1e-9)
+    logs[list(neutral)] = 0
+    return np.exp2(stops * logs).astype(np.float32)
 
 
 def _to_bytes(image: np.ndarray) -> np.ndarray:
@@ -893,15 +1036,19 @@ def _write_layout(target: Path, force: bool, write: Callable[[Path], None]) -> N
 
 def _parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Renders a sample scene, so that nothing needs to be downloaded.")
-    parser.add_argument("output", type=Path, help="folder that will hold llff/ and blender/")
-    parser.add_argument("--layout", choices=("llff", "blender", "both"), default="both", help="which to write")
-    parser.add_argument("--num-views", type=int, default=20, help="llff: number of pictures")
-    parser.add_argument("--width", type=int, help="columns of the pictures (default: llff 252, blender 100)")
-    parser.add_argument("--height", type=int, help="llff: rows of the pictures (default: 3/4 of the columns)")
+    parser.add_argument("output", type=Path, help="folder that will hold llff/, blender/ or nerfstudio/")
+    layouts = ("llff", "blender", "both", "nerfstudio")
+    parser.add_argument("--layout", choices=layouts, default="both", help="which to write; both: llff and blender")
+    parser.add_argument("--num-views", type=int, default=20, help="llff and nerfstudio: number of pictures")
+    parser.add_argument("--width", type=int, help="columns of the pictures (default: 252, blender 100)")
+    parser.add_argument("--height", type=int, help="rows of the pictures but blender's (default: 3/4 of the columns)")
     parser.add_argument("--num-train", type=int, default=100, help="blender: number of training pictures")
     parser.add_argument("--num-val", type=int, default=10, help="blender: number of validation pictures")
     parser.add_argument("--num-test", type=int, default=25, help="blender: number of test pictures")
     parser.add_argument("--supersample", type=int, default=3, help="rays along each side of a pixel; odd")
+    parser.add_argument("--exposure", type=float, default=0.0, help="stops by which training pictures differ")
+    parser.add_argument("--shiny", type=float, default=0.0, help="brightness of a lamp's reflection, 0 to 1")
+    parser.add_argument("--distortion", type=float, default=0.0, help="nerfstudio: k1 of the lens, -0.2 to 0.5")
     parser.add_argument("--seed", type=int, default=0, help="which textures and cameras")
     parser.add_argument("--force", action="store_true", help="replace what OUTPUT holds already")
     options = parser.parse_args(arguments)
@@ -912,6 +1059,11 @@ def _parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:
             parser.error(f"--{name.replace('_', '-')} is {value}, but has to be at least {least}")
     if options.supersample % 2 == 0:
         parser.error(f"--supersample is {options.supersample}, but has to be odd")
+    for name, low, high in (("exposure", 0.0, 3.0), ("shiny", 0.0, 1.0), ("distortion", -0.2, 0.5)):
+        if not low <= getattr(options, name) <= high:
+            parser.error(f"--{name} is {getattr(options, name)}, but has to be between {low} and {high}")
+    if options.distortion != 0 and options.layout != "nerfstudio":
+        parser.error("--distortion needs --layout nerfstudio: the other layouts have no place for it")
     if options.seed < 0:
         parser.error(f"--seed is {options.seed}, but has to be at least 0")
     return options
@@ -921,6 +1073,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     """The command line; `arguments` default to the process's own. Returns the exit status."""
     options = _parse(arguments)
     common = {"supersample": options.supersample, "seed": options.seed}
+    common |= {"exposure": options.exposure, "shine": options.shiny}
     try:
         if options.layout in ("llff", "both"):
             size = {"width": options.width or 252, "height": options.height}
@@ -935,6 +1088,15 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
                 options.output / "blender",
                 options.force,
                 lambda folder: write_blender(folder, *counts, width=options.width or 100, **common),
+            )
+        if options.layout == "nerfstudio":
+            size = {"width": options.width or 252, "height": options.height}
+            _write_layout(
+                options.output / "nerfstudio",
+                options.force,
+                lambda folder: write_nerfstudio(
+                    folder, options.num_views, **size, **common, distortion=options.distortion
+                ),
             )
     except OSError as error:
         print(f"Error: {error}", file=sys.stderr)

@@ -4,6 +4,7 @@ A subcommand is a function here: its arguments and docstring are the command lin
 when it runs, so that help is there at once.
 """
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any, Callable, Dict, Optional, Sequence, Tuple
 
@@ -75,7 +76,38 @@ def evaluate(
     print(f"{len(report.views)} held-out views; the report is {output_path}")
 
 
+@exit_on_input_error
+def effects(
+    dataparser: Annotated[str, tyro.conf.Positional],
+    data: Path,
+    json: bool = False,
+    num_views: Optional[int] = None,
+    view_ids: Optional[Tuple[int, ...]] = None,
+    coarse_run: Optional[Path] = None,
+    style_image: Optional[Path] = None,
+) -> None:
+    """Prints which effects a scene calls for, and why, without training.
+
+    Args:
+        dataparser: What reads the scene: llff-data, blender-data, nerfstudio-data, colmap or another of nerfstudio's.
+        data: The scene's folder or file.
+        json: Print JSON: a list `effects` of name, on, measured, threshold, reason.
+        num_views: How many photos to train on, as for ns-train.
+        view_ids: Which photos to train on, as for ns-train.
+        coarse_run: A coarse run of the scene, on which the effects of stage 2 are measured.
+        style_image: The painting, with which the photos' palette is compared.
+    """
+    from contextlib import redirect_stdout
+
+    from sparsestyle_ns.effects.command import measure_scene
+
+    with redirect_stdout(sys.stderr):  # what dataparsers have to say must not get into the JSON
+        decisions = measure_scene(dataparser, data, num_views, view_ids, coarse_run, style_image)
+    print(decisions.json() if json else decisions.text())
+
+
 SUBCOMMANDS: Dict[str, Callable[..., Any]] = {
+    "effects": effects,
     "evaluate": evaluate,
     "gallery": gallery,
 }

@@ -3,13 +3,15 @@
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Dict, Iterable, List, Optional
+from typing import Any, Callable, Dict, Iterable, List, Optional
 
 import torch
 import yaml
+from jaxtyping import Float
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
+from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
 from sparsestyle_ns.scene_record import FILE_NAME, SceneRecord
@@ -36,9 +38,19 @@ class CoarseRun:
 
     def model_state(self) -> Dict[str, Tensor]:
         """The state of the run's model."""
-        state = load_checkpoint(self.checkpoint)["pipeline"]
-        prefix = "_model."
-        return {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
+        return under(load_checkpoint(self.checkpoint)["pipeline"], "_model.")
+
+    def density(self, effects: Decisions) -> Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]:
+        """σ_c at field coordinates, as a function; `effects` are those that the run was made with."""
+        with torch.random.fork_rng(devices=[]):  # what is made after it starts as it would without
+            field = self.config.pipeline.model.coarse_field.setup(effects).requires_grad_(False)
+        field.load_state_dict(under(self.model_state(), "field."))
+        return lambda points: field.density_and_feature(points)[0]
+
+
+def under(state: Dict[str, Tensor], prefix: str) -> Dict[str, Tensor]:
+    """The entries whose names begin with a prefix, without it."""
+    return {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
 
 
 def checkpoint_step(path: Path) -> int:

@@ -3,8 +3,7 @@
 import copy
 import functools
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Annotated, Any, Dict, Literal, Optional, Tuple, Type, Union
+from typing import Annotated, Any, Dict, Optional, Tuple, Type, Union
 
 import torch
 import tyro
@@ -19,6 +18,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sparsestyle_ns.dataparsers.transforms import check_transforms
+from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings, decide
+from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.photos import PhotoDataset, check_one_size, open_photo
 from sparsestyle_ns.processes import num_processes
@@ -40,6 +42,10 @@ class FewShotDataManagerConfig(VanillaDataManagerConfig):
     """Photos whose longer side is over this many pixels are reduced to it."""
     seed: int = 42
     """Seed of the choice of pixels; a step's batch depends on it and the step alone, so a resumed run sees the same."""
+    effects: tyro.conf.Suppress[EffectSettings] = ALL_AUTO
+    """The pipeline's, which hands them on."""
+    decided: tyro.conf.Suppress[Optional[Decisions]] = None
+    """What was decided before; None: the scene is measured."""
 
 
 @dataclass
@@ -67,11 +73,12 @@ class TrainingPixels:
 class FewShotDataManager(VanillaDataManager[PhotoDataset]):
     """Keeps the few training views, and all their rays, in memory.
 
-    It chooses the views (`select_views`), reduces large photos, and adds to the datasets' metadata what the models need
-    to know of the scene: `space`, `background_color` and `view_ids`.
+    It chooses the views (`select_views`), reduces large photos, has the effects decided, and adds to the datasets'
+    metadata what the models need to know of the scene: `effects` and `view_ids`.
     """
 
     config: FewShotDataManagerConfig
+    effects: Decisions
 
     @property
     def dataparser(self) -> DataParser:
@@ -87,10 +94,10 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         """The dataset of the selected views only."""
         outputs = self.train_dataparser_outputs
         ids = outputs.metadata.get("view_ids", list(range(len(outputs.image_filenames))))
-        space = scene_space(outputs)
+        forward_facing = outputs.metadata.get("space") == "ndc"
         standard = BLENDER_VIEWS if isinstance(self.config.dataparser, BlenderDataParserConfig) else None
-        default = DEFAULT_NUM_VIEWS.get(space, 8)
-        if space == "ndc" and self.dataparser.config.eval_interval >= len(ids):
+        default = DEFAULT_NUM_VIEWS["llff" if forward_facing else "other"]
+        if forward_facing and self.dataparser.config.eval_interval >= len(ids):
             default = len(ids)
         chosen = select_views(ids, self.config.num_views, self.config.view_ids, default, standard)
         self.view_ids = tuple(ids[position] for position in chosen)
@@ -103,7 +110,13 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
             CONSOLE.print(
                 f"Training on {len(chosen)} of {len(ids)} views: {', '.join(map(str, self.view_ids))} ({names})."
             )
-        return self._dataset(self.train_dataparser_outputs, space)
+        self.effects = self.config.decided or decide(self.scene, self.config.effects)
+        return self._dataset(self.train_dataparser_outputs)
+
+    @property
+    def scene(self) -> Scene:
+        """The training views, for measuring."""
+        return Scene.of(self.train_dataparser_outputs)
 
     def create_eval_dataset(self) -> PhotoDataset:
         """The dataparser's whole held-out split; the training views where it holds out none, as of very few photos."""
@@ -111,21 +124,17 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         if not outputs.image_filenames:
             CONSOLE.print("No view is held out; evaluating on the training views.")
             outputs = self.train_dataparser_outputs
-        return self._dataset(outputs, self.train_dataset.metadata["space"])
+        return self._dataset(outputs)
 
-    def _dataset(self, outputs: DataparserOutputs, space: str) -> PhotoDataset:
+    def _dataset(self, outputs: DataparserOutputs) -> PhotoDataset:
         limit = self.config.max_image_side
         longest = int(max(outputs.cameras.width.max(), outputs.cameras.height.max()))
         scale = self.config.camera_res_scale_factor
         if limit is not None and longest * scale > limit:
             scale = limit / longest
         dataset = self.dataset_type(dataparser_outputs=outputs, scale_factor=scale)
-        background = outputs.alpha_color
-        dataset.metadata.update(
-            space=space,
-            background_color=None if background is None or space != "box" else background.tolist(),
-            view_ids=self.view_ids,
-        )
+        dataset.cameras.distortion_params = self.effects.build("lens_distortion", cameras=dataset.cameras)
+        dataset.metadata.update(effects=self.effects, view_ids=self.view_ids)
         return dataset
 
     def setup_train(self) -> None:
@@ -193,19 +202,6 @@ def check_cameras(outputs: DataparserOutputs) -> None:
             f"The camera of {photo} has a pose that is not finite, or a focal length or size that is not above 0: "
             "correct it, or take the photo out of the scene."
         )
-
-
-def scene_space(outputs: DataparserOutputs) -> Literal["ndc", "box", "contracted"]:
-    """The space a scene is laid out in: the dataparser's own word, else a box where the photos have transparency."""
-    if "space" in outputs.metadata:
-        return outputs.metadata["space"]
-    return "box" if outputs.alpha_color is not None and has_transparency(outputs.image_filenames[0]) else "contracted"
-
-
-def has_transparency(path: Path) -> bool:
-    """Whether an image has an alpha channel with anything but full opacity in it."""
-    image = open_photo(path)
-    return "A" in image.getbands() and image.getchannel("A").getextrema()[0] < 255
 
 
 def select_outputs(outputs: DataparserOutputs, positions: Tuple[int, ...]) -> DataparserOutputs:

@@ -70,6 +70,7 @@ class RunPictures:
         video: an MP4 file's bytes.
         figures: (label, value) of measurements.
         settings: (label, value) of how the run was made.
+        effects: lines of the table of effects, the first of them its heading.
     """
 
     name: str
@@ -81,6 +82,7 @@ class RunPictures:
     video: Optional[bytes] = None
     figures: List[Tuple[str, str]] = field(default_factory=list)
     settings: List[Tuple[str, str]] = field(default_factory=list)
+    effects: List[Tuple[str, ...]] = field(default_factory=list)
 
 
 # ---------------------------------------------------------------------------------------------------------- the page
@@ -245,7 +247,19 @@ def _facts(run: RunPictures) -> str:
         '<div class="facts">'
         + _definitions("Measured", "figures", run.figures)
         + _definitions("Settings", "settings", run.settings)
+        + _table("Effects", "effects", run.effects)
         + "</div>"
+    )
+
+
+def _table(heading: str, name: str, rows: Sequence[Tuple[str, ...]]) -> str:
+    if not rows:
+        return ""
+    head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in rows[0])
+    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows[1:])
+    return (
+        f'<div class="{name}"><h3>{heading}</h3><div class="scroll"><table><thead><tr>{head}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div></div>\n"
     )
 
 
@@ -338,6 +352,10 @@ dd { overflow-wrap: anywhere; }
 .figures dd { font-family: var(--serif); font-size: 1.75rem; line-height: 1.25; font-variant-numeric: lining-nums; }
 .settings dl { grid-template-columns: repeat(auto-fill, minmax(14rem, 1fr)); }
 .settings dd { font-size: 0.9375rem; }
+.scroll { overflow-x: auto; }
+.effects table { width: 100%; border-collapse: collapse; font-size: 0.875rem; }
+.effects th, .effects td { border-top: 1px solid var(--line); padding: 0.375rem 1rem 0.375rem 0; text-align: left; }
+.effects th { border-top: 0; color: var(--soft); font-weight: 400; }
 @media (max-width: 46rem) {
   .sources { flex-direction: column; align-items: stretch; gap: 1rem; }
   .photos, .painting { flex: none; }
@@ -426,6 +444,7 @@ def collect_run(config_path: Path, video: Optional[Path] = None, num_views: int 
         video=content,
         figures=_figures(measured),
         settings=_settings(config, dataset, step),
+        effects=pipeline.effects.rows(),
     )
 
 
@@ -546,6 +565,5 @@ def _settings(config: Any, dataset: Any, step: int) -> List[Tuple[str, str]]:
             f"{pipeline.content_weight:g} to {pipeline.content_weight * pipeline.content_decay:g} in "
             f"{pipeline.content_steps} iterations",
         ),
-        ("Palette transfer", "yes" if pipeline.palette_transfer else "no"),
         ("Warm start", f"{pipeline.warm_start_steps} steps"),
     ]

@@ -25,10 +25,14 @@ from sparsestyle_ns.coarse_run import (
     newest_checkpoint,
     read_coarse_run,
 )
+from sparsestyle_ns.datamanager import FewShotDataManager
+from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.errors import InputError, exit_on_input_error
 from sparsestyle_ns.finite_steps import FiniteOptimizers
 from sparsestyle_ns.processes import any_process, from_first_process, prepare_launch, share_state
-from sparsestyle_ns.scene_record import SceneRecord, record_scene
+from sparsestyle_ns.scene_record import record_scene
+from sparsestyle_ns.style.image import load_style_image
 from sparsestyle_ns.whole_files import write_text_whole, write_whole
 
 STEPS_PER_LOOK = 10
@@ -86,13 +90,20 @@ class SparseStyleTrainer(Trainer):
     config: SparseStyleTrainerConfig
     optimizers: FiniteOptimizers
 
+    def __init__(self, config: SparseStyleTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        super().__init__(config, local_rank, world_size)
+        self._total = config.max_num_iterations
+
     @exit_on_input_error
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Sets up the run and records what it is trained on."""
+        """Sets up the run and records what it is trained on, and which effects are simulated."""
         if self.config.max_skipped_steps < 1:
             raise InputError(f"--max-skipped-steps is {self.config.max_skipped_steps}; give 1 or more.")
         self._reported = 0
         self._kept_step: Optional[int] = None
+        checkpoint = self.resumed_checkpoint()
+        if checkpoint is not None:
+            self.config.pipeline.decided = read_decisions(checkpoint, self.config.pipeline.effects)
         super().setup(test_mode)
         self._save_record()
 
@@ -103,14 +114,38 @@ class SparseStyleTrainer(Trainer):
     @check_main_thread
     def _save_record(self) -> None:
         record_scene(self.pipeline.datamanager).save(self.base_dir)
+        self.save_decisions()
 
-    def _load_checkpoint(self) -> None:
+    def save_decisions(self) -> None:
+        """Writes which effects are simulated into effects.json, and into config.yml, from which a run is loaded."""
+        self.pipeline.effects.save(self.base_dir)
+        self._saved_decisions = self.pipeline.effects
+        iterations, self.config.max_num_iterations = self.config.max_num_iterations, self._total
+        self.config.save_config()
+        self.config.max_num_iterations = iterations
+
+    def resumed_checkpoint(self) -> Optional[Path]:
+        """The checkpoint that training goes on from; None for a new run.
+
+        Raises:
+            InputError: there is none where the command line says.
+        """
         for source in (self.config.load_dir, self.config.load_checkpoint):
             if source is not None and not source.exists():
                 raise InputError(
                     f"There is nothing to resume at {source}; name a folder of checkpoints or a .ckpt file."
                 )
-        checkpoint = self._checkpoint_to_resume()
+        folder, step = self.config.load_dir, self.config.load_step
+        if folder is None:
+            return self.config.load_checkpoint
+        checkpoint = newest_checkpoint(folder) if step is None else folder / f"step-{step:09d}.ckpt"
+        if checkpoint is None or not checkpoint.is_file():
+            what = "checkpoint" if step is None else f"checkpoint of iteration {step}"
+            raise InputError(f"There is no {what} in {folder}; name a run's nerfstudio_models folder.")
+        return checkpoint
+
+    def _load_checkpoint(self) -> None:
+        checkpoint = self.resumed_checkpoint()
         if checkpoint is not None:
             self._resume(load_checkpoint(checkpoint))
             CONSOLE.print(f"Going on from {checkpoint}.", soft_wrap=True)
@@ -126,23 +161,13 @@ class SparseStyleTrainer(Trainer):
         self._start_step = state["step"] + 1
         self._kept_step = state["step"]
 
-    def _checkpoint_to_resume(self) -> Optional[Path]:
-        folder, step = self.config.load_dir, self.config.load_step
-        if folder is None:
-            return self.config.load_checkpoint
-        checkpoint = newest_checkpoint(folder) if step is None else folder / f"step-{step:09d}.ckpt"
-        if checkpoint is None or not checkpoint.is_file():
-            what = "checkpoint" if step is None else f"checkpoint of iteration {step}"
-            raise InputError(f"There is no {what} in {folder}; name a run's nerfstudio_models folder.")
-        return checkpoint
-
     @exit_on_input_error
     def train(self) -> None:
         """Trains up to `max_num_iterations`, counted from the very first iteration, also when resuming.
 
         Ctrl-C ends training after the iteration that is under way and saves a checkpoint; a second one stops at once.
         """
-        total = self.config.max_num_iterations
+        total = self._total
         if self._start_step >= total:
             raise InputError(
                 f"The checkpoint is of iteration {self._start_step}, and --max-num-iterations is {total}; raise it to "
@@ -220,7 +245,7 @@ class SparseStyleTrainer(Trainer):
 
     def notes(self) -> Dict[str, Any]:
         """What a checkpoint says beside the state: numbers and words only."""
-        return {}
+        return {"effects": self.pipeline.effects.records()}
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
@@ -268,6 +293,22 @@ class SparseStyleTrainer(Trainer):
             for path in self.checkpoint_dir.glob("step-*.ckpt"):
                 if path != target:
                     path.unlink()
+        if self.pipeline.effects != self._saved_decisions:
+            self.save_decisions()
+
+
+def read_decisions(checkpoint: Path, settings: Any) -> Optional[Decisions]:
+    """Which effects a checkpoint was made with; None where it doesn't say.
+
+    Raises:
+        InputError: the settings ask for others.
+    """
+    records = load_checkpoint(checkpoint).get("effects")
+    if records is None:
+        return None
+    decisions = Decisions.from_records(records)
+    decisions.check_choices(settings, f"the checkpoint {checkpoint}")
+    return decisions
 
 
 def without_numpy_scalars(value: Any) -> Any:
@@ -319,9 +360,11 @@ class HierStyleTrainer(SparseStyleTrainer):
         self.config.pipeline.check_style()
         run = None
         if self.config.load_dir is None and self.config.load_checkpoint is None:
-            run = self.coarse_run()
+            manager = self._photos()
+            run = self.coarse_run(manager)
             self.config.pipeline.coarse_run = run.folder.resolve()
             self.config.pipeline.model.coarse_field = copy.deepcopy(run.config.pipeline.model.coarse_field)
+            self.config.pipeline.decided = self._decide(manager, run)
         else:
             self._adopt_shape_of_checkpoint()
         self._coarse_state = None if run is None else run.model_state()
@@ -335,7 +378,7 @@ class HierStyleTrainer(SparseStyleTrainer):
 
     def notes(self) -> Dict[str, Any]:
         """Which feature network stylised the scene, and where its weights came from."""
-        return {"backbone": asdict(self.pipeline.targets.backbone.description)}
+        return {**super().notes(), "backbone": asdict(self.pipeline.targets.backbone.description)}
 
     def _load_checkpoint(self) -> None:
         super()._load_checkpoint()
@@ -345,20 +388,22 @@ class HierStyleTrainer(SparseStyleTrainer):
 
     def _adopt_shape_of_checkpoint(self) -> None:
         """Takes the coarse field's settings from the run that is resumed; they came from its coarse run."""
-        folder = self.config.load_dir or self.config.load_checkpoint.parent
-        path = folder.parent / "config.yml"
+        path = self.resumed_checkpoint().parent.parent / "config.yml"
         if path.is_file():
             saved = yaml.load(path.read_text(), Loader=yaml.Loader)
             self.config.pipeline.model.coarse_field = saved.pipeline.model.coarse_field
             self.config.pipeline.coarse_run = saved.pipeline.coarse_run
 
-    def coarse_run(self) -> CoarseRun:
+    def coarse_run(self, manager: FewShotDataManager) -> CoarseRun:
         """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now.
+
+        Args:
+            manager: the photos, with what was decided about them.
 
         Raises:
             InputError: the run that was asked for doesn't exist or is of another scene.
         """
-        scene = self._scene()
+        scene = record_scene(manager)
         asked = self.config.pipeline.coarse_run
         if asked is not None:
             run = read_coarse_run(asked)
@@ -372,13 +417,21 @@ class HierStyleTrainer(SparseStyleTrainer):
             CONSOLE.print(f"Stylising the newest coarse run of this scene, {found.folder}.")
             return found
         CONSOLE.print("There is no finished coarse run of this scene and these views; training one first.")
-        return self._train_coarse(methods[-1])
+        return self._train_coarse(methods[-1], manager.effects)
 
-    def _scene(self) -> SceneRecord:
+    def _photos(self) -> FewShotDataManager:
         config = copy.deepcopy(self.config.pipeline.datamanager)
-        return record_scene(config.setup(device="cpu", test_mode="inference"))
+        config.effects = self.config.pipeline.effects
+        return config.setup(device="cpu", test_mode="inference")
 
-    def _train_coarse(self, method: str) -> CoarseRun:
+    def _decide(self, manager: FewShotDataManager, run: CoarseRun) -> Decisions:
+        """What is simulated: as in the coarse run, and the rest by its field and the painting."""
+        settings, scene = self.config.pipeline, manager.scene
+        scene.coarse_density = run.density(manager.effects)
+        scene.style_image = load_style_image(settings.style_image)
+        return decide(scene, settings.effects, manager.effects)
+
+    def _train_coarse(self, method: str, decided: Decisions) -> CoarseRun:
         from sparsestyle_ns.method_configs import method_config
 
         config: TrainerConfig = copy.deepcopy(method_config(method))
@@ -393,6 +446,7 @@ class HierStyleTrainer(SparseStyleTrainer):
             "camera_res_scale_factor",
         ):
             setattr(config.pipeline.datamanager, name, copy.deepcopy(ours[name]))
+        config.pipeline.effects, config.pipeline.decided = self.config.pipeline.effects, decided
         config.data, config.output_dir = self.config.data, self.config.output_dir
         config.experiment_name, config.project_name = self.config.experiment_name, self.config.project_name
         config.machine, config.logging = self.config.machine, self.config.logging

@@ -3,12 +3,15 @@
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import List
+from typing import TYPE_CHECKING, Dict, List
 
 import hypothesis
 import numpy as np
 import pytest
 from PIL import Image
+
+if TYPE_CHECKING:
+    from sparsestyle_ns.effects.base import Decisions
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "data_scripts")]
@@ -31,15 +34,29 @@ TINY = [
     *("--pipeline.datamanager.train-num-rays-per-batch", "128"),
     *("--pipeline.model.coarse-field.layer-width", "32"),
     *("--pipeline.model.coarse-field.feature-dim", "8"),
+    *("--pipeline.effects.empty-space", "on"),
 ]
-"""A coarse field that learns nothing good, in no time."""
+"""A coarse field that learns nothing good, in no time, and so leaves nothing empty."""
 TINY_STYLE = [
     *("--pipeline.model.log2-table-size", "12"),
     *("--pipeline.model.num-steps", "16"),
     *("--pipeline.model.occupancy-resolution", "16"),
     *("--pipeline.feature-side", "48"),
     *("--pipeline.warm-start-steps", "2"),
+    *("--pipeline.effects.empty-space", "on"),
 ]
+
+
+def decided(*on: str, **parameters: Dict[str, List[float]]) -> "Decisions":
+    """Decisions by which some effects are on, with parameters by the effect's name, and all others off."""
+    from sparsestyle_ns.effects.base import Decision, Decisions
+    from sparsestyle_ns.effects.registry import EFFECTS
+
+    assert set(on) <= EFFECTS.keys()
+    items = (
+        Decision(name, name in on, None, None, "for a test", parameters=parameters.get(name, {})) for name in EFFECTS
+    )
+    return Decisions(tuple(items))
 
 
 def ns_train(method: str, data: Path, output_dir: Path, *flags: str, parser: str = "llff-data") -> None:

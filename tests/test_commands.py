@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from sparsestyle_ns.coarse_run import newest_checkpoint
 from sparsestyle_ns.datamanager import FewShotDataManagerConfig
+from sparsestyle_ns.effects.registry import EFFECTS
 from sparsestyle_ns.method_configs import method_config
 
 METHODS = ("coarse-fewshot", "coarse-fewshot-draft", "hier-style", "hier-style-draft")
@@ -95,7 +96,8 @@ def test_the_defaults_are_the_papers() -> None:
     assert (settings.content_weight, settings.content_decay, settings.content_steps) == (10.0, 0.01, 100)
     assert (model.hash_levels, model.min_resolution, model.max_resolution) == (8, 128, 512)
     assert (model.features_per_level, model.log2_table_size) == (4, 19)
-    assert (model.hidden_layers, model.layer_width, model.residual_density) == (2, 256, True)
+    assert (model.hidden_layers, model.layer_width) == (2, 256)
+    assert {getattr(settings.effects, name) for name in EFFECTS} == {"auto"}
 
 
 def test_the_views_in_use_are_saved_with_the_run(runs: SimpleNamespace) -> None:
@@ -103,7 +105,7 @@ def test_the_views_in_use_are_saved_with_the_run(runs: SimpleNamespace) -> None:
         scene = json.loads((run / "scene.json").read_text())
         assert scene["view_ids"] == [1, 5, 11]  # of 12 photos, 0 and 8 are held out; evenly spaced in the other ten
         assert scene["view_names"] == ["image001.png", "image005.png", "image011.png"]
-        assert scene["space"] == "ndc"
+        assert scene["effects"]["ndc"]
 
 
 def test_a_stylised_checkpoint_holds_the_whole_scene_and_nothing_else(runs: SimpleNamespace) -> None:
@@ -289,7 +291,7 @@ def test_blender_scenes_train_too(tmp_path: Path, painting: Path) -> None:
     style = ["--style-image", str(painting), "--max-num-iterations", "2", *TINY_STYLE]
     ns_train("hier-style", scene, outputs, *style, parser="blender-data")
     saved = json.loads((only_run(outputs, "hier-style") / "scene.json").read_text())
-    assert (saved["space"], saved["background_color"]) == ("box", [1.0, 1.0, 1.0])
+    assert saved["effects"]["box"] and saved["background_color"] == [1.0, 1.0, 1.0]
     assert saved["view_ids"] == [0, 1, 2, 3, 5, 6, 7, 8]  # eight evenly spaced of nine: too few for the standard eight
 
 
@@ -321,7 +323,7 @@ def test_nerfstudio_captures_train_on_the_views_asked_for_in_contracted_space(tm
     flags = ["--num-views", "4", "--max-num-iterations", "2", *TINY]
     ns_train("coarse-fewshot", tmp_path / "capture", tmp_path / "outputs", *flags, parser="nerfstudio-data")
     scene = json.loads((only_run(tmp_path / "outputs", "coarse-fewshot") / "scene.json").read_text())
-    assert scene["space"] == "contracted"
+    assert scene["effects"]["contraction"] and scene["background_color"] is None
     assert len(scene["view_names"]) == 4
 
 

@@ -1,7 +1,7 @@
 """`coarse-fewshot`: learns the coarse field of a scene from a few photos (stage 1)."""
 
 from dataclasses import dataclass, field
-from typing import Any, Dict, List, Literal, Optional, Tuple, Type
+from typing import Any, Dict, List, Optional, Tuple, Type
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
@@ -10,6 +10,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
+from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.field_components.positional_encoding import revealed_levels
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
@@ -21,8 +22,8 @@ from sparsestyle_ns.rendering.compositing import distortion, effective_samples
 from sparsestyle_ns.rendering.density_grid import DensityGrid
 from sparsestyle_ns.rendering.precision import Precision, autocast
 from sparsestyle_ns.rendering.sampling import even_edges
-from sparsestyle_ns.rendering.space import Segments, make_space
-from sparsestyle_ns.rendering.volume import DenseRender, render_coarse
+from sparsestyle_ns.rendering.space import Segments
+from sparsestyle_ns.rendering.volume import DenseRender, render_coarse, seen_behind
 from sparsestyle_ns.schedules import ramp
 
 
@@ -38,17 +39,17 @@ class CoarseFieldConfig:
     """Units in a hidden layer."""
     feature_dim: int = 64
     """Length of the geometric feature e_c."""
-    direction_levels: Optional[int] = None
-    """Octaves of the view direction's encoding: 4 for the paper's F_c(γ(x), d). None for colour that doesn't depend on
-    the view: three photos can't tell shine from shape (README, Where we depart from the paper)."""
+    direction_levels: int = 4
+    """Octaves of the view direction's encoding, where colour depends on it (`--pipeline.effects.view-color`)."""
     density_activation: DensityActivation = "exp"
     """What keeps the density positive. exp finds surfaces sooner than softplus (README, Where the paper is silent)."""
     density_bias: float = 1.0
     """Added to the density's logit: a field that starts as dense fog is less drawn to the far end of its rays."""
 
-    def setup(self) -> CoarseField:
-        """The field."""
-        return CoarseField(**vars(self))
+    def setup(self, effects: Decisions) -> CoarseField:
+        """The field, for what was decided about the scene."""
+        levels = effects.build("view_color", direction_levels=self.direction_levels)
+        return CoarseField(**(vars(self) | {"direction_levels": levels}))
 
 
 @dataclass
@@ -60,19 +61,17 @@ class CoarseFewShotModelConfig(ModelConfig):
     """Unused: the space of the scene decides where rays start and end."""
     coarse_field: CoarseFieldConfig = field(default_factory=CoarseFieldConfig)
     """The coarse field."""
-    sampling: Literal["guided", "even"] = "guided"
-    """guided: samples go where a grid remembers density; even: evenly over the ray, jittered, as NeRF's first pass."""
     num_samples: int = 24
     """Samples a ray in training."""
     num_eval_samples: int = 64
     """Samples a ray in rendering."""
     num_bins: int = 64
-    """Bins of the histogram that guided samples follow."""
+    """Bins of the histogram that samples follow where empty space is skipped."""
     thinning: float = 2.0
     """Samples whose gradient is smaller than this many times the batch's mean take part in the backward pass with a
     probability in proportion only, and count for more where they do; 0: all samples take part."""
     even_share: float = 0.1
-    """Share of guided samples, in (0, 1], that is spread evenly."""
+    """Share of those samples, in (0, 1], that is spread evenly."""
     grid_resolution: int = 64
     """Cells along a side of the grid that remembers density."""
     distortion_weight: float = 0.015
@@ -101,20 +100,27 @@ class CoarseFewShotModel(Model):
     config: CoarseFewShotModelConfig
 
     def populate_modules(self) -> None:
-        """Builds the field, the space and the grid that guides samples."""
+        """Builds the field, the space, and what the scene's effects need."""
         super().populate_modules()
         metadata: Dict[str, Any] = self.kwargs["metadata"]
-        self.space = make_space(self.scene_box, metadata)
-        self.field = self.config.coarse_field.setup()
-        self.grid = DensityGrid(self.config.grid_resolution) if self.config.sampling == "guided" else None
-        color = metadata["background_color"]
-        self.register_buffer("background", None if color is None else torch.tensor(color), persistent=False)
+        effects: Decisions = metadata["effects"]
+        self.space = effects.build_space(scene_box=self.scene_box, metadata=metadata)
+        self.field = self.config.coarse_field.setup(effects)
+        self.build_grid(effects)
+        self.exposure = effects.build("exposure", num_photos=self.num_train_data)
+        self.register_buffer("background", effects.build("background"), persistent=False)
         self.step = 0
         self.num_steps = 1
 
+    def build_grid(self, effects: Decisions) -> None:
+        """Makes the grid that guides samples, or takes it away, as is decided; a new one knows nothing yet."""
+        grid = effects.build("empty_space", grid=DensityGrid, resolution=self.config.grid_resolution)
+        self.grid = None if grid is None else grid.to(next(self.field.parameters()).device)
+
     def get_param_groups(self) -> Dict[str, List[Parameter]]:
-        """One group, `fields`."""
-        return {"fields": list(self.field.parameters())}
+        """One group, `fields`: the field, and the photos' exposures where they are learned."""
+        exposure = [] if self.exposure is None else list(self.exposure.parameters())
+        return {"fields": [*self.field.parameters(), *exposure]}
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -144,7 +150,7 @@ class CoarseFewShotModel(Model):
         return torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + self.step)
 
     def place_samples(self, segments: Segments, num_samples: int, generator: Optional[torch.Generator]) -> Tensor:
-        """Borders of samples on rays, as the setting `sampling` says."""
+        """Borders of samples on rays: where the grid remembers density, or evenly without one."""
         if self.grid is None:
             return even_edges(len(segments.hit), num_samples, self.device, generator)
         return self.grid.place_samples(
@@ -183,8 +189,12 @@ class CoarseFewShotModel(Model):
         render, edges = self.render_batch(ray_bundle.origins, ray_bundle.directions)
         if self.grid is not None:
             self.grid.remember(render.positions, render.density)
+        rgb = render.rgb
+        if self.exposure is not None:
+            behind = seen_behind(render.accumulation, self.background)
+            rgb = self.exposure(rgb, behind, ray_bundle.camera_indices.squeeze(-1))
         return {
-            "rgb": render.rgb,
+            "rgb": rgb,
             "accumulation": render.accumulation,
             "edges": edges,
             "weights": render.weights,

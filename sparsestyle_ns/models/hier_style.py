@@ -11,6 +11,7 @@ from nerfstudio.viewer.viewer_elements import ViewerDropdown
 from torch import Tensor
 from torch.nn import Parameter
 
+from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.residual import ResidualField
@@ -19,7 +20,7 @@ from sparsestyle_ns.rendering.baked import BakedVolume, Rays, render_baked
 from sparsestyle_ns.rendering.density_grid import Occupancy, march
 from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
 from sparsestyle_ns.rendering.precision import Precision, autocast
-from sparsestyle_ns.rendering.space import ForwardFacingSpace, Segments, make_space
+from sparsestyle_ns.rendering.space import ForwardFacingSpace, Segments
 from sparsestyle_ns.rendering.volume import (
     POINTS_PER_CALL,
     FrozenSamples,
@@ -60,14 +61,12 @@ class HierStyleModelConfig(ModelConfig):
     """Hidden layers of the residual field's MLP."""
     layer_width: int = 256
     """Units in a hidden layer."""
-    residual_density: bool = True
-    """Whether the residual field changes the geometry (Eq. 3); off, only the colour is learned."""
     residual_density_scale: float = 10.0
     """Unit of the residual density, per half side of the scene's cube."""
     num_steps: int = 128
     """Even steps along a ray; those in empty cells are skipped."""
     occupancy_resolution: int = 128
-    """Cells along a side of the grid that says what is empty."""
+    """Cells along a side of the grid that says what is empty, where empty space is skipped."""
     min_alpha: float = 0.03
     """Opacity over a cell's side, in (0, 1), below which the coarse field counts as empty there."""
     min_transmittance: float = 1e-3
@@ -91,12 +90,13 @@ class HierStyleModel(Model):
     config: HierStyleModelConfig
 
     def populate_modules(self) -> None:
-        """Builds both fields, the space, and the grid of empty cells."""
+        """Builds both fields, the space, and what the scene's effects need."""
         super().populate_modules()
         metadata: Dict[str, Any] = self.kwargs["metadata"]
+        effects: Decisions = metadata["effects"]
         config = self.config
-        self.space = make_space(self.scene_box, metadata)
-        self.field = config.coarse_field.setup().requires_grad_(False)
+        self.space = effects.build_space(scene_box=self.scene_box, metadata=metadata)
+        self.field = config.coarse_field.setup(effects).requires_grad_(False)
         grid = HashGrid(
             config.hash_levels,
             config.min_resolution,
@@ -110,11 +110,13 @@ class HierStyleModel(Model):
             config.hidden_layers,
             config.layer_width,
             config.residual_density_scale,
-            config.residual_density,
+            effects.on("residual_density"),
         )
-        self.occupancy = Occupancy(config.occupancy_resolution)
-        color = metadata["background_color"]
-        self.register_buffer("background", None if color is None else torch.tensor(color), persistent=False)
+        self.occupancy = effects.build("empty_space", grid=Occupancy, resolution=config.occupancy_resolution)
+        self.exposure = effects.build("exposure", num_photos=self.num_train_data)
+        if self.exposure is not None:
+            self.exposure.requires_grad_(False)
+        self.register_buffer("background", effects.build("background"), persistent=False)
         self.render_mode = ViewerDropdown(
             "Render mode", config.render_mode, ["exact", "baked"], hint="baked: quick, from a voxel grid"
         )
@@ -126,15 +128,19 @@ class HierStyleModel(Model):
 
     @torch.no_grad()
     def adopt_coarse(self, state: Dict[str, Tensor]) -> None:
-        """Takes over a coarse model's field and space, and finds out which cells are empty.
+        """Takes over a coarse model's field, space and exposures, and finds out which cells are empty.
 
         Args:
             state: the state of a `CoarseFewShotModel` with the same settings of the field and of the space.
         """
-        for name in ("field", "space"):
+        for name in ("field", "space", "exposure"):
+            if getattr(self, name) is None:
+                continue
             part = {key[len(name) + 1 :]: value for key, value in state.items() if key.startswith(name + ".")}
             getattr(self, name).load_state_dict(part, strict=True)
         self.field.to(self.device)
+        if self.occupancy is None:
+            return
         with autocast(self.device, self.config.precision):
             self.occupancy.measure(
                 lambda points: self.field.density_and_feature(points)[0], self.config.min_alpha, POINTS_PER_CALL

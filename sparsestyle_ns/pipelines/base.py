@@ -1,33 +1,70 @@
 """What the pipelines of both methods have in common."""
 
+from dataclasses import dataclass, field
 from typing import Any, Dict, Literal, Optional
 
+import tyro
+from nerfstudio.data.datamanagers.base_datamanager import DataManagerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch.amp import GradScaler
 
+from sparsestyle_ns.datamanager import FewShotDataManager, FewShotDataManagerConfig
+from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.panel import EffectsPanel
+from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings
 from sparsestyle_ns.errors import InputError, exit_on_input_error
 from sparsestyle_ns.ffmpeg import put_ffmpeg_on_path
 
 TestMode = Literal["test", "val", "inference"]
 
 
+@dataclass
+class CheckedPipelineConfig(VanillaPipelineConfig):
+    """Settings of both methods' pipelines."""
+
+    datamanager: DataManagerConfig = field(default_factory=FewShotDataManagerConfig)
+    """The photos."""
+    effects: EffectSettings = ALL_AUTO
+    """Which effects are simulated; auto measures whether the scene calls for them."""
+    decided: tyro.conf.Suppress[Optional[Decisions]] = None
+    """What was decided, with its reasons; a loaded run has it and measures nothing."""
+
+
 class CheckedPipeline(VanillaPipeline):
-    """A pipeline that ends with a clear sentence on bad input, and never loads a checkpoint in part."""
+    """A pipeline that ends with a clear sentence on bad input, and never loads a checkpoint in part.
+
+    It receives what was decided about the scene's effects, or has it decided, and keeps it in its config.
+    """
+
+    config: CheckedPipelineConfig
+    datamanager: FewShotDataManager
 
     @exit_on_input_error
     def __init__(
         self,
-        config: VanillaPipelineConfig,
+        config: CheckedPipelineConfig,
         device: str,
         test_mode: TestMode = "val",
         world_size: int = 1,
         local_rank: int = 0,
         grad_scaler: Optional[GradScaler] = None,
     ) -> None:
+        config.datamanager.effects, config.datamanager.decided = config.effects, config.decided
         # However many processes there are, the model is not to be wrapped (see `processes`).
         super().__init__(config, device, test_mode, 1, local_rank, grad_scaler)
+        config.decided = self.datamanager.effects
+        config.datamanager.decided = None
+        CONSOLE.print("Effects:", self.effects.text(), sep="\n", soft_wrap=True, highlight=False)
+        self.effects_panel = EffectsPanel(lambda: self.effects.markdown())
         if test_mode != "val":
             put_ffmpeg_on_path()
+
+    @property
+    def effects(self) -> Decisions:
+        """What is simulated, and why."""
+        assert self.config.decided is not None
+        return self.config.decided
 
     @exit_on_input_error
     def load_pipeline(self, loaded_state: Dict[str, Any], step: int) -> None:

@@ -11,25 +11,22 @@ import tyro
 from jaxtyping import Float
 from nerfstudio.cameras.camera_utils import get_interpolated_poses
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.datamanagers.base_datamanager import DataManagerConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.base_model import ModelConfig
-from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 from torch import Tensor
 
-from sparsestyle_ns.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.finite_steps import broken, step_if_finite
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
-from sparsestyle_ns.pipelines.base import CheckedPipeline
+from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
 from sparsestyle_ns.processes import average_gradients, num_processes, own_share, put_together
 from sparsestyle_ns.rendering.frozen_view import FrozenView
-from sparsestyle_ns.rendering.volume import accumulation_of
+from sparsestyle_ns.rendering.volume import accumulation_of, seen_behind
 from sparsestyle_ns.schedules import content_weight
-from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
+from sparsestyle_ns.style.color import apply_palette, color_moments
 from sparsestyle_ns.style.image import load_style_image
 from sparsestyle_ns.style.targets import StyleTargets
 from sparsestyle_ns.style.vgg import load_backbone
@@ -39,12 +36,10 @@ WARM_START_LEARNING_RATE = 5e-3
 
 
 @dataclass
-class HierStylePipelineConfig(VanillaPipelineConfig):
+class HierStylePipelineConfig(CheckedPipelineConfig):
     """Settings of stage 2."""
 
     _target: Type = field(default_factory=lambda: HierStylePipeline)
-    datamanager: DataManagerConfig = field(default_factory=FewShotDataManagerConfig)
-    """The photos."""
     model: ModelConfig = field(default_factory=HierStyleModelConfig)
     """The stylised field."""
     style_image: Annotated[Optional[Path], tyro.conf.arg(aliases=("--style-image",))] = None
@@ -69,8 +64,6 @@ class HierStylePipelineConfig(VanillaPipelineConfig):
     """α, what is left of it in the end."""
     content_steps: int = 100
     """T, the iterations in which it falls."""
-    palette_transfer: bool = True
-    """Whether photos are given the painting's colours before stylising (ARF, Sec. 4)."""
     warm_start_steps: int = 60
     """Steps, before the first iteration, in which c_f is fitted to whole photos; 0 is the paper's start from grey."""
     novel_views: int = 0
@@ -156,8 +149,9 @@ class HierStylePipeline(CheckedPipeline):
             view = self._freeze(pixels.origins[rows], pixels.directions[rows], keep_bytes)
             keep_bytes -= view.kept_bytes
             frozen.append(view)
-            pictures.append(pixels.colors[rows].view(height, width, 3))
-            weights.append(put_together(view.render(accumulation_of), height * width).view(height, width))
+            accumulation = put_together(view.render(accumulation_of), height * width)
+            pictures.append(self._photo(index, pixels.colors[rows], accumulation).view(height, width, 3))
+            weights.append(accumulation.view(height, width))
         for camera in self._novel_cameras():
             bundle = camera.generate_rays(camera_indices=0, keep_shape=True).to(self.device)
             rays = bundle.flatten()
@@ -167,7 +161,7 @@ class HierStylePipeline(CheckedPipeline):
             outputs = self.model.get_outputs_for_camera_ray_bundle(bundle)
             pictures.append(outputs["rgb_coarse"])
             weights.append(outputs["accumulation"].squeeze(-1))
-        if self.config.palette_transfer:
+        if self.effects.on("palette"):
             pictures = self._in_style_colors(pictures, weights)
         self.views = [
             ContentView(
@@ -176,6 +170,12 @@ class HierStylePipeline(CheckedPipeline):
             for view, picture, weight in zip(frozen, pictures, weights, strict=True)
         ]
         self._report_cache()
+
+    def _photo(self, index: int, colors: Tensor, accumulation: Tensor) -> Tensor:
+        """A photo's colours, at the mean exposure where photos have their own."""
+        if self.model.exposure is None:
+            return colors
+        return self.model.exposure.undone(colors, seen_behind(accumulation, self.model.background), index)
 
     def _cache_bytes(self) -> float:
         if self.config.cache_gigabytes is not None:
@@ -188,9 +188,9 @@ class HierStylePipeline(CheckedPipeline):
         chunks = sum(view.frozen.num_chunks for view in self.views)
         whole = sum(view.frozen.is_kept for view in self.views)
         note = "" if whole == len(self.views) else "; the rest is computed again in each iteration"
+        occupied = "" if self.model.occupancy is None else f", {self.model.occupancy.share:.0%} of space occupied"
         CONSOLE.print(
-            f"{len(self.views)} views in {chunks} chunks, {self.model.occupancy.share:.0%} of space occupied; "
-            f"{whole} views kept in {kept / 2**20:.0f} MiB{note}."
+            f"{len(self.views)} views in {chunks} chunks{occupied}; {whole} views kept in {kept / 2**20:.0f} MiB{note}."
         )
 
     def _freeze(self, origins: Tensor, directions: Tensor, keep_bytes: float) -> FrozenView:
@@ -237,7 +237,7 @@ class HierStylePipeline(CheckedPipeline):
         colors = torch.cat([picture.reshape(-1, 3) for picture in pictures[:photos]])
         weight = torch.cat([weight.reshape(-1) for weight in weights[:photos]])
         style = color_moments(self.targets.style_image.permute(1, 2, 0).reshape(-1, 3))
-        matrix, offset = palette_transform(*color_moments(colors, weight), *style)
+        matrix, offset = self.effects.build("palette", content=color_moments(colors, weight), style=style)
         transferred = [apply_palette(picture, matrix, offset, clamp=True) for picture in pictures]
         if self.model.background is None:
             return transferred

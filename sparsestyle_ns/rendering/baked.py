@@ -170,17 +170,21 @@ class Rays:
 
     Attributes:
         segments: the rays.
-        occupancy: which cells are empty.
+        occupancy: which cells are empty; None: none is.
         num_steps: even steps along a ray.
         unbounded: whether the last step goes on to infinity.
         min_transmittance: share of light left below which a ray ends.
     """
 
     segments: Segments
-    occupancy: Occupancy
+    occupancy: Optional[Occupancy]
     num_steps: int
     unbounded: bool
     min_transmittance: float
+
+
+ONE_CELL = np.ones((1, 1, 1), dtype=bool)
+"""The kernels' grid where nothing is skipped."""
 
 
 @torch.no_grad()
@@ -218,7 +222,7 @@ def march_compiled(
     while len(left):
         missing = torch.full((len(left), baked_kernels.LOOKAHEAD), baked_kernels.NO_CELL)
         voxels = baked_kernels.Voxels(
-            rays.occupancy.occupied.numpy(),
+            ONE_CELL if rays.occupancy is None else rays.occupancy.occupied.numpy(),
             volume.slots.numpy(),
             volume.codes.numpy().view("<u8").squeeze(-1),
             volume.resolution,

@@ -162,18 +162,20 @@ class PackedSamples(NamedTuple):
 
 
 @torch.no_grad()
-def march(segments: Segments, occupancy: Occupancy, num_steps: int, unbounded: bool) -> PackedSamples:
-    """The samples of `num_steps` even steps along each ray that lie in occupied cells.
+def march(segments: Segments, occupancy: Optional[Occupancy], num_steps: int, unbounded: bool) -> PackedSamples:
+    """The samples of `num_steps` even steps along each ray that lie in occupied cells; all without an `occupancy`.
 
     In an unbounded space the last step is always kept: its interval goes on to infinity.
     """
     edges = even_edges(len(segments.hit), num_steps, segments.hit.device)
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
     positions = segments.positions(middle)
-    keep = occupancy.contains(positions)
-    if unbounded:
-        keep[:, -1] = True
-    keep &= segments.hit[:, None]
+    keep = segments.hit[:, None].expand(-1, num_steps)
+    if occupancy is not None:
+        filled = occupancy.contains(positions)
+        if unbounded:
+            filled[:, -1] = True
+        keep = keep & filled
     ray_indices, step = keep.nonzero(as_tuple=True)
     lengths = interval_lengths(segments, edges, unbounded)
     return PackedSamples(ray_indices, middle[keep], lengths[ray_indices, step], positions[keep])

@@ -9,7 +9,7 @@ the cube, so that the scale of the world's coordinates doesn't matter.
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Dict, Optional, Tuple, Union
+from typing import Optional, Tuple, Union
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -284,18 +284,3 @@ class ContractedSpace(Space):
         """See `Space.segments`."""
         hit = torch.ones(len(origins), dtype=torch.bool, device=origins.device)
         return ContractedSegments(origins / self.unit, directions, self.near, self.unit, hit)
-
-
-def make_space(scene_box: SceneBox, metadata: Dict[str, Any]) -> Space:
-    """The space that a dataset's metadata asks for: its key `space` is "ndc", "box" or "contracted".
-
-    Coordinates within the scene box, which nerfstudio's dataparsers make for the cameras' size, aren't contracted.
-    """
-    if metadata["space"] == "ndc":
-        focal_over_half_size, depth_range = (
-            tuple(metadata[key]) for key in ("ndc_focal_over_half_size", "ndc_depth_range")
-        )
-        return ForwardFacingSpace(scene_box, focal_over_half_size, metadata["ndc_near"], depth_range)
-    if metadata["space"] == "box":
-        return BoxSpace(scene_box)
-    return ContractedSpace(unit=0.5 * (scene_box.aabb[1] - scene_box.aabb[0]).amax().item())

@@ -50,6 +50,13 @@ SAMPLES_PER_PASS = 6
 """Samples of a ray that are evaluated before looking whether it goes on."""
 
 
+def seen_behind(
+    accumulation: Float[Tensor, "rays 1"], background: Optional[Float[Tensor, "3"]]
+) -> Float[Tensor, "rays 3"]:
+    """The part of rays' colours that is background; 0 where there is none."""
+    return torch.zeros_like(accumulation).expand(-1, 3) if background is None else (1.0 - accumulation) * background
+
+
 def over_background(
     rgb: Float[Tensor, "rays 3"], accumulation: Float[Tensor, "rays 1"], background: Optional[Float[Tensor, "3"]]
 ) -> Float[Tensor, "rays 3"]:
@@ -123,7 +130,7 @@ class FrozenSamples:
 def freeze_samples(
     field: CoarseField,
     residual: ResidualField,
-    occupancy: Occupancy,
+    occupancy: Optional[Occupancy],
     segments: Segments,
     num_steps: int,
     unbounded: bool,
@@ -136,7 +143,7 @@ def freeze_samples(
 
 def visible_samples(
     field: CoarseField,
-    occupancy: Occupancy,
+    occupancy: Optional[Occupancy],
     segments: Segments,
     num_steps: int,
     unbounded: bool,
@@ -144,7 +151,8 @@ def visible_samples(
 ) -> Tuple[PackedSamples, Float[Tensor, "samples"], Float[Tensor, "samples feature"]]:
     """The samples of a batch of rays that can show, and σ_c and e_c there.
 
-    Samples lie in occupied cells, and in front of them at least `min_transmittance` of the light is left.
+    Samples lie in occupied cells, where a grid says which are, and in front of them at least `min_transmittance` of the
+    light is left.
     """
     num_rays = len(segments.hit)
     samples = march(segments, occupancy, num_steps, unbounded)

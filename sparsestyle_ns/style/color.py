@@ -39,6 +39,24 @@ def color_moments(
     return mean, (weight * centred).T @ centred / total
 
 
+def gaussian_distance(
+    first_mean: Float[Tensor, "3"],
+    first_covariance: Float[Tensor, "3 3"],
+    second_mean: Float[Tensor, "3"],
+    second_covariance: Float[Tensor, "3 3"],
+) -> Float[Tensor, ""]:
+    """2-Wasserstein distance between two Gaussians, in float64 (Dowson and Landau 1982).
+
+    W² = |μ_1 − μ_2|² + tr(Σ_1 + Σ_2 − 2 (Σ_1^½ Σ_2 Σ_1^½)^½).
+    """
+    first, second = first_covariance.double(), second_covariance.double()
+    variances, axes = torch.linalg.eigh(first)
+    root = (axes * variances.clamp_min(0).sqrt()) @ axes.T
+    shared = torch.linalg.eigvalsh(root @ second @ root).clamp_min(0).sqrt().sum()
+    spread = (first.trace() + second.trace() - 2 * shared).clamp_min(0)
+    return ((first_mean.double() - second_mean.double()).square().sum() + spread).sqrt()
+
+
 def palette_transform(
     content_mean: Float[Tensor, "3"],
     content_covariance: Float[Tensor, "3 3"],

@@ -20,6 +20,7 @@ from make_sample_scene import (
     look_at,
     main,
     objects_on_a_plinth,
+    photo_gains,
     poses_bounds_row,
     render_sample,
     still_life,
@@ -339,3 +340,55 @@ def test_a_senseless_number_is_refused_by_name(flag, tmp_path, capsys):
     with pytest.raises(SystemExit, match="2"):
         main([str(tmp_path), flag])
     assert flag.split("=")[0] in capsys.readouterr().err
+
+
+def test_exposures_have_a_geometric_mean_of_one_and_stay_within_the_stops_asked_for():
+    gains = photo_gains(12, 0.5, [0, 8])
+    exposed = np.delete(gains, [0, 8], axis=0)
+    assert (gains[[0, 8]] == 1).all()
+    assert np.log2(exposed).mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-6)
+    assert np.abs(np.log2(exposed)).max() == pytest.approx(0.5)
+    assert (photo_gains(5, 0.0, []) == 1).all()
+
+
+def test_only_training_pictures_are_exposed_differently(llff, tmp_path):
+    options = ["--width", "24", "--num-views", "9", "--supersample", "1"]
+    for name, more in (("plain", []), ("exposed", ["--exposure", "1"])):
+        assert main([str(tmp_path / name), "--layout", "llff", *options, *more]) == 0
+    for view in range(9):
+        plain, exposed = (
+            imageio.imread(tmp_path / name / "llff" / "images" / f"image{view:03d}.png")
+            for name in ("plain", "exposed")
+        )
+        assert (plain == exposed).all() == (view in (0, 8))
+
+
+def test_what_shines_looks_different_from_elsewhere_and_only_brighter(two_views):
+    pose, matt, _ = two_views[0]
+    shiny, _, _ = render_sample(pose, FOCAL, HEIGHT, WIDTH, still_life(shine=0.8))
+    assert (shiny >= matt - 1e-6).all()
+    assert (shiny - matt).max() > 0.3
+
+
+def test_a_bent_lens_sees_along_the_rays_that_nerfstudio_makes_of_its_parameters(tmp_path):
+    import torch
+    from make_sample_scene import _band_of_rays
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    options = ["--width", "24", "--num-views", "9", "--supersample", "1", "--distortion", "0.3"]
+    assert main([str(tmp_path), "--layout", "nerfstudio", *options]) == 0
+    parser = NerfstudioDataParserConfig(data=tmp_path / "nerfstudio").setup()
+    outputs = parser.get_dataparser_outputs("train")
+    assert [path.name for path in outputs.image_filenames] == [f"image{i:03d}.png" for i in range(1, 8)]
+    found = outputs.cameras.generate_rays(camera_indices=0, keep_shape=True).directions
+    pose = outputs.cameras.camera_to_worlds[0].numpy()
+    expected, _ = _band_of_rays(pose, float(outputs.cameras.fx[0]), 18, 24, np.arange(18), 1, 0.3)
+    # nerfstudio inverts the lens in float32 up to 1e-3.
+    torch.testing.assert_close(found.reshape(-1, 3), torch.from_numpy(expected.T).float(), atol=2e-3, rtol=0)
+
+
+def test_distortion_is_refused_where_the_layout_has_no_place_for_it(tmp_path):
+    with pytest.raises(SystemExit):
+        main([str(tmp_path), "--layout", "llff", "--distortion", "0.1"])
+    with pytest.raises(SystemExit):
+        main([str(tmp_path), "--layout", "llff", "--shiny", "2"])

@@ -6,6 +6,7 @@ from hard.table import hard_case
 from nerfstudio.data.scene_box import SceneBox
 from torch.nn.functional import normalize
 
+from sparsestyle_ns.effects.layouts import Contraction
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.rendering.baked_kernels import _is_occupied
 from sparsestyle_ns.rendering.density_grid import DensityGrid, Occupancy, march
@@ -17,7 +18,6 @@ from sparsestyle_ns.rendering.space import (
     ForwardFacingSpace,
     contract,
     intersect_box,
-    make_space,
 )
 from sparsestyle_ns.rendering.volume import render_coarse
 
@@ -33,6 +33,10 @@ def boxed(aabb=CUBE, **settings):
 def forward_facing(scale=1.0, depth_range=(1.5, 9.0)):
     near, far = depth_range
     return ForwardFacingSpace(SceneBox(aabb=CUBE), FOCAL, near=scale, depth_range=(scale * near, scale * far))
+
+
+def contracted(aabb):
+    return Contraction().build({}, scene_box=SceneBox(aabb=aabb))
 
 
 def rays(count=64, seed=0):
@@ -311,8 +315,8 @@ def test_a_forward_facing_scene_looks_alike_at_any_scale(scale):
 @pytest.mark.parametrize("scale", SCALES)
 def test_a_box_looks_alike_at_any_scale(scale):
     origins, directions = rays()
-    rgb, distance = picture(make_space(SceneBox(aabb=CUBE), {"space": "box"}), origins, directions)
-    space = make_space(SceneBox(aabb=scale * CUBE), {"space": "box"})
+    rgb, distance = picture(boxed(), origins, directions)
+    space = boxed(scale * CUBE)
     scaled_rgb, scaled_distance = picture(space, scale * origins, directions)
     torch.testing.assert_close(scaled_rgb, rgb, rtol=0, atol=1e-4)
     torch.testing.assert_close(scaled_distance, scale * distance, rtol=1e-3, atol=0)
@@ -327,8 +331,8 @@ def test_a_box_looks_alike_at_any_scale(scale):
 @pytest.mark.parametrize("scale", SCALES)
 def test_a_contracted_scene_looks_alike_at_any_scale(scale):
     origins, directions = rays()
-    rgb, distance = picture(make_space(SceneBox(aabb=CUBE), {"space": "contracted"}), origins, directions)
-    space = make_space(SceneBox(aabb=scale * CUBE), {"space": "contracted"})
+    rgb, distance = picture(contracted(CUBE), origins, directions)
+    space = contracted(scale * CUBE)
     scaled_rgb, scaled_distance = picture(space, scale * origins, directions)
     torch.testing.assert_close(scaled_rgb, rgb, rtol=0, atol=1e-4)
     torch.testing.assert_close(scaled_distance, scale * distance, rtol=1e-3, atol=0)

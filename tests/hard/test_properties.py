@@ -24,6 +24,7 @@ import sparsestyle_ns.losses
 import sparsestyle_ns.rendering
 import sparsestyle_ns.style
 from sparsestyle_ns import schedules
+from sparsestyle_ns.effects.layouts import BoundedBox, Contraction, ForwardFacing
 from sparsestyle_ns.field_components import hash_grid, hash_grid_kernels, positional_encoding, thinned_mlp
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
@@ -115,12 +116,13 @@ def spaces(draw):
     aabb = torch.tensor([[-1.0, -0.7, -0.5], [0.8, 1.0, 0.6]])
     nearest = scale * 10 ** draw(st.floats(0, 1))
     metadata = {
-        "space": kind,
         "ndc_focal_over_half_size": [1.5, 2.0],
         "ndc_near": scale,
         "ndc_depth_range": [nearest, nearest * 10 ** draw(st.sampled_from([0, 1e-7, 0.5, 4]))],
     }
-    return space.make_space(SceneBox(aabb=aabb if kind == "ndc" else scale * aabb), metadata), scale
+    layout = {"ndc": ForwardFacing, "box": BoundedBox, "contracted": Contraction}[kind]()
+    box = SceneBox(aabb=aabb if kind == "ndc" else scale * aabb)
+    return layout.build({}, scene_box=box, metadata=metadata), scale
 
 
 def packed_indices(draw, samples):
@@ -235,7 +237,7 @@ def test_contraction_and_spacing_stay_in_their_ranges(data, count, dtype):
     assert space.inverse_spacing(spaced).max() <= space.MAX_DISTANCE * (1 + 1e-6)
 
 
-@covers(space.intersect_box, space.make_space, density_grid.interval_lengths)
+@covers(space.intersect_box, density_grid.interval_lengths)
 @given(st.data(), spaces(), unit_rays(), st.integers(1, 64))
 def test_segments_are_numbers_in_any_space(data, scene, rays, samples):
     layout, scale = scene

@@ -14,7 +14,6 @@ from sparsestyle_ns.rendering.space import (
     contract,
     intersect_box,
     inverse_spacing,
-    make_space,
     spacing,
 )
 
@@ -231,21 +230,6 @@ def test_spacing_is_even_in_distance_near_by_and_in_disparity_far_away():
     distances = torch.logspace(-3, 3, 50, dtype=torch.float64)
     torch.testing.assert_close(inverse_spacing(spacing(distances)), distances)
     assert inverse_spacing(torch.tensor([1.0])).item() == pytest.approx(MAX_DISTANCE)
-
-
-def test_the_metadata_of_a_dataset_chooses_its_space():
-    scene_box = SceneBox(aabb=BOX)
-    forward = make_space(
-        scene_box,
-        {"space": "ndc", "ndc_focal_over_half_size": [1.5, 2.0], "ndc_near": 0.7, "ndc_depth_range": [1.0, 9.0]},
-    )
-    assert isinstance(forward, ForwardFacingSpace) and forward.unbounded
-    assert (forward.focal_over_half_size, forward.near) == ((1.5, 2.0), 0.7)
-    inside = make_space(scene_box, {"space": "box"})
-    assert isinstance(inside, BoxSpace) and not inside.unbounded
-    assert torch.equal(torch.stack([inside.minimum, inside.maximum]), BOX)
-    around = make_space(scene_box, {"space": "contracted"})
-    assert isinstance(around, ContractedSpace) and around.unbounded
 
 
 def test_the_longest_side_of_a_box_fills_the_cube_and_the_others_keep_their_proportion():

@@ -4,7 +4,13 @@ import reference
 import torch
 
 from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.style.color import SMALLEST_SPREAD, apply_palette, color_moments, palette_transform
+from sparsestyle_ns.style.color import (
+    SMALLEST_SPREAD,
+    apply_palette,
+    color_moments,
+    gaussian_distance,
+    palette_transform,
+)
 
 
 def correlated_colors(seed, count=500, dtype=torch.float64):
@@ -124,3 +130,14 @@ def test_transferred_colours_pass_an_exact_gradient():
     content = correlated_colors(0, count=4).requires_grad_()
     transform = palette_transform(*color_moments(correlated_colors(0)), *color_moments(correlated_colors(1)))
     assert torch.autograd.gradcheck(lambda colors: apply_palette(colors, *transform), (content,))
+
+
+def test_the_distance_of_two_palettes_is_that_of_their_means_and_of_their_spreads():
+    mean, covariance = torch.zeros(3), torch.diag(torch.tensor([0.04, 0.01, 0.09]))
+    shifted = gaussian_distance(mean, covariance, mean + torch.tensor([0.3, 0.0, 0.4]), covariance)
+    assert shifted.item() == pytest.approx(0.5)
+    # Along shared axes it is the distance of the standard deviations: (0.2, 0.1, 0.3) and twice that.
+    spread = gaussian_distance(mean, covariance, mean, 4 * covariance)
+    assert spread.item() == pytest.approx((0.04 + 0.01 + 0.09) ** 0.5)
+    turned = color_moments(correlated_colors(3))
+    assert gaussian_distance(*turned, *turned).item() == pytest.approx(0, abs=1e-6)

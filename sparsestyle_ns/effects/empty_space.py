@@ -1,0 +1,44 @@
+"""Sampling and marching that pass over what is empty."""
+
+from typing import Any, Dict, List
+
+import torch
+from torch import nn
+
+from sparsestyle_ns.effects.base import Effect, Measurement
+from sparsestyle_ns.effects.scene import Scene
+
+MIN_EMPTY = 0.1
+"""Share of space that must be empty for looking it up to pay."""
+CELLS = 64
+"""Cells along a side of the cube, over one of which a point's opacity is taken."""
+MIN_ALPHA = 0.03
+"""Opacity over a cell's side below which a point is empty."""
+NUM_POINTS = 1 << 14
+"""Points, always the same, at which a field is asked."""
+
+
+@torch.no_grad()
+def opacities(scene: Scene) -> torch.Tensor:
+    """1 − exp(−σ · cell side) of the coarse field at `NUM_POINTS` points of the cube."""
+    points = 2.0 * torch.rand(NUM_POINTS, 3, generator=torch.Generator().manual_seed(0)) - 1.0
+    return -torch.expm1(-scene.coarse_density(points).float().cpu() * (2.0 / CELLS))
+
+
+class EmptySpace(Effect):
+    """Grids that remember where something is: stage 1 puts its samples there, stage 2 skips the rest."""
+
+    name = "empty_space"
+    help = "Empty-space skipping: enough of space is empty; decided again while stage 1 trains."
+    source = "coarse field"
+
+    def measure(self, scene: Scene) -> Measurement:
+        """See `Effect.measure`; the share of space in which the coarse field is all but transparent."""
+        if scene.coarse_density is None:
+            return Measurement(True, "assumed until there is a coarse field to measure", None, MIN_EMPTY)
+        empty = float((opacities(scene) < MIN_ALPHA).float().mean())
+        return Measurement(empty >= MIN_EMPTY, "of space is empty", empty, MIN_EMPTY)
+
+    def build(self, parameters: Dict[str, List[float]], **needs: Any) -> nn.Module:
+        """See `Effect.build`; the kind of `grid` that is asked for, with its `resolution`."""
+        return needs["grid"](needs["resolution"])

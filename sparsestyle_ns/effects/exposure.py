@@ -1,0 +1,103 @@
+"""Photos that differ by a gain: exposure and white balance, three numbers a photo."""
+
+from typing import Any, Dict, List, Tuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from sparsestyle_ns.effects.base import Effect, Measurement
+from sparsestyle_ns.effects.matches import ColorMatches
+from sparsestyle_ns.effects.scene import Scene
+
+MIN_STOPS = 0.1
+"""Gain of a photo's channel against the mean of all photos, in stops, from which on photos differ."""
+MIN_MATCHES = 20
+"""Matched points of every photo below which its gain can't be measured."""
+DARK = 0.02
+"""Added to colours before their ratio is taken, so that black doesn't count as infinitely dark."""
+ROBUST = 0.02
+"""Log ratio below which differences count by their square, above by their size."""
+
+
+def fit_gains(matches: ColorMatches) -> Tuple[Float[np.ndarray, "views 3"], Float[np.ndarray, "matches 3"]]:
+    """Each photo's log gain, and what of the colours' log ratios it doesn't explain.
+
+    The gains minimise the sum of absolute differences (iteratively reweighted least squares), with a mean of zero over
+    the photos in each channel.
+    """
+    ratios = np.log((matches.colors_second + DARK) / (matches.colors_first + DARK))
+    rows = np.arange(len(matches))
+    design = np.zeros((len(matches) + 1, matches.num_views))
+    design[rows, matches.second] += 1.0
+    design[rows, matches.first] -= 1.0
+    design[-1] = 1.0
+    gains = np.zeros((matches.num_views, 3))
+    for channel in range(3):
+        weights = np.ones(len(design))
+        target = np.append(ratios[:, channel], 0.0)
+        for _ in range(15):
+            gains[:, channel] = np.linalg.lstsq(design * weights[:, None], target * weights, rcond=None)[0]
+            error = np.abs(target - design @ gains[:, channel])
+            weights[:-1] = 1.0 / np.sqrt(np.maximum(error[:-1], ROBUST))
+    return gains, ratios - design[:-1] @ gains
+
+
+class ExposureCorrection(nn.Module):
+    """A gain for each photo and channel, exp(g) with the mean of g over the photos at 0.
+
+    That gauge makes the scene's own colours those of the mean exposure, which is what views without a photo show.
+
+    Args:
+        num_photos: how many.
+    """
+
+    def __init__(self, num_photos: int) -> None:
+        super().__init__()
+        self.log_gain = nn.Parameter(torch.zeros(num_photos, 3))
+
+    def gains(self) -> Float[Tensor, "photos 3"]:
+        """The photos' gains; their geometric mean is 1."""
+        return torch.exp(self.log_gain - self.log_gain.mean(dim=0))
+
+    def forward(
+        self, rgb: Float[Tensor, "rays 3"], behind: Float[Tensor, "rays 3"], photos: Int[Tensor, "rays"]
+    ) -> Float[Tensor, "rays 3"]:
+        """What photos show of a scene: the light from it times the photo's gain, the background as it is.
+
+        Args:
+            rgb: the scene's own colours, background included.
+            behind: the background's part of them.
+            photos: which photo each ray belongs to.
+        """
+        return (rgb - behind) * self.gains()[photos] + behind
+
+    def undone(
+        self, colors: Float[Tensor, "pixels 3"], behind: Float[Tensor, "pixels 3"], photo: int
+    ) -> Float[Tensor, "pixels 3"]:
+        """A photo's colours at the mean exposure, cut to [0, 1]: the inverse of `forward` for one photo."""
+        return ((colors - behind) / self.gains()[photo] + behind).clamp(0.0, 1.0)
+
+
+class Exposure(Effect):
+    """One gain for each photo and channel, learned with the field."""
+
+    name = "exposure"
+    help = "Exposure and white balance of each photo: photos differ by a gain."
+
+    def measure(self, scene: Scene) -> Measurement:
+        """See `Effect.measure`; the largest gain of a photo against the mean, in stops, from matched points."""
+        fewest = scene.matches.fewest_in_a_view()
+        if fewest < MIN_MATCHES:
+            return Measurement(
+                False, f"not measurable: a photo has {fewest} matched points, fewer than {MIN_MATCHES}", None, MIN_STOPS
+            )
+        gains, _ = fit_gains(scene.matches)
+        stops = float(np.abs(gains).max() / np.log(2.0))
+        words = f"stops at most between a photo and the mean, by {len(scene.matches)} matched points"
+        return Measurement(stops >= MIN_STOPS, words, stops, MIN_STOPS)
+
+    def build(self, parameters: Dict[str, List[float]], **needs: Any) -> ExposureCorrection:
+        """See `Effect.build`; needs the number of photos."""
+        return ExposureCorrection(needs["num_photos"])

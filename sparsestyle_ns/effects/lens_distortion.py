@@ -1,0 +1,52 @@
+"""Rays of lenses that bend straight lines."""
+
+from typing import Any, Dict, List, Optional
+
+import numpy as np
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from sparsestyle_ns.effects.base import Effect, Measurement
+from sparsestyle_ns.effects.matches import undistorted
+from sparsestyle_ns.effects.scene import Scene
+
+MIN_PIXELS = 0.25
+"""Shift of a photo's pixel by the lens from which on it matters."""
+
+
+def largest_shift(cameras: Cameras) -> float:
+    """How far, in pixels, distortion moves the point of an image's border that it moves most; 0 without any."""
+    if cameras.distortion_params is None or not cameras.distortion_params.any():
+        return 0.0
+    shift = 0.0
+    around = np.linspace(-1.0, 1.0, 9)
+    sides = [np.stack([around, np.full(9, side)], axis=-1) for side in (-1.0, 1.0)]
+    rim = np.concatenate([*sides, *(side[:, ::-1] for side in sides)])
+    for index in range(len(cameras)):
+        focal = np.array([float(cameras.fx[index]), float(cameras.fy[index])])
+        center = np.array([float(cameras.cx[index]), float(cameras.cy[index])])
+        half = 0.5 * np.array([float(cameras.width[index]), float(cameras.height[index])])
+        points = (half + rim * half - center) / focal
+        moved = (undistorted(points, cameras, index) - points) * focal
+        shift = max(shift, float(np.linalg.norm(moved, axis=-1).max()))
+    return shift
+
+
+class LensDistortion(Effect):
+    """The cameras' distortion parameters, by which nerfstudio bends their rays."""
+
+    name = "lens_distortion"
+    help = "Lens distortion: the cameras' parameters move pixels."
+
+    def measure(self, scene: Scene) -> Measurement:
+        """See `Effect.measure`; the largest shift of a pixel, in pixels of the photos as they are."""
+        if scene.cameras.distortion_params is None:
+            words = "the cameras have no distortion parameters"
+            return Measurement(False, words, 0.0, MIN_PIXELS, possible=False)
+        shift = largest_shift(scene.cameras)
+        return Measurement(shift >= MIN_PIXELS, "pixels at most by which the lens moves a point", shift, MIN_PIXELS)
+
+    def build(self, parameters: Dict[str, List[float]], **needs: Any) -> Optional[Float[Tensor, "views 6"]]:
+        """See `Effect.build`; the distortion parameters of some cameras."""
+        return needs["cameras"].distortion_params

@@ -1,0 +1,169 @@
+"""Colours of the same surface points in different photos, found by matching and checked against the cameras.
+
+SIFT keypoints are matched in both directions with Lowe's ratio test; a match counts where it obeys the epipolar
+geometry of the two known cameras within a pixel. Colours are those of blurred photos, so that a match that is off by a
+fraction of a pixel doesn't count as a difference.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import List, Optional, Sequence, Tuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+from nerfstudio.cameras.cameras import Cameras
+
+MAX_KEYPOINTS = 2000
+MAX_RATIO = 0.8
+"""Lowe's ratio: the best match's distance over the second best's."""
+MAX_EPIPOLAR_ERROR = 1.0
+"""Sampson distance, in pixels, up to which a match obeys the cameras."""
+BLUR = 2.0
+"""Standard deviation, in pixels, of the blur under which colours are taken."""
+NEAREST_VIEWS = 6
+"""Photos that each photo is matched with: those whose cameras look most nearly the same way."""
+
+
+@dataclass
+class ColorMatches:
+    """Points seen in two photos.
+
+    Attributes:
+        first, second: which photos.
+        colors_first, colors_second: RGB there, in [0, 1].
+        num_views: photos in all.
+    """
+
+    first: Int[np.ndarray, "matches"]
+    second: Int[np.ndarray, "matches"]
+    colors_first: Float[np.ndarray, "matches 3"]
+    colors_second: Float[np.ndarray, "matches 3"]
+    num_views: int
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def fewest_in_a_view(self) -> int:
+        """Matches of the photo that has fewest; 0 where some photos hang together with the others by none."""
+        counts = np.zeros((self.num_views, self.num_views), dtype=int)
+        np.add.at(counts, (self.first, self.second), 1)
+        counts += counts.T
+        reached = np.eye(self.num_views, dtype=bool)
+        for _ in range(self.num_views):
+            reached = reached | (reached @ (counts > 0))
+        return int(counts.sum(axis=1).min()) if reached.all() else 0
+
+
+@dataclass
+class _Keypoints:
+    points: Float[np.ndarray, "points 2"]
+    rays: Float[np.ndarray, "points 3"]
+    descriptors: Float[np.ndarray, "points 128"]
+    scale: float
+
+
+def match_colors(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras) -> ColorMatches:
+    """Finds points that two photos see, and their colours; only where both photos are opaque.
+
+    Args:
+        photos: RGBA in [0, 1].
+        cameras: one for each, for images of any size with the same aspect.
+    """
+    keypoints = [find_keypoints(photo, cameras, index) for index, photo in enumerate(photos)]
+    blurred = [cv2.GaussianBlur(photo, (0, 0), BLUR) for photo in photos]
+    poses = cameras.camera_to_worlds.double().numpy()
+    found: List[Tuple[np.ndarray, ...]] = []
+    for first, second in neighbouring_pairs(poses):
+        one, other = keypoints[first], keypoints[second]
+        if one is None or other is None:
+            continue
+        here, there = mutual_matches(one.descriptors, other.descriptors)
+        error = epipolar_error(one.rays[here], other.rays[there], poses[first], poses[second])
+        fits = error < MAX_EPIPOLAR_ERROR * max(one.scale, other.scale)
+        here, there = here[fits], there[fits]
+        colors = sample(blurred[first], one.points[here]), sample(blurred[second], other.points[there])
+        opaque = (colors[0][:, 3] > 0.99) & (colors[1][:, 3] > 0.99)
+        count = int(opaque.sum())
+        found.append((np.full(count, first), np.full(count, second), *(each[opaque, :3] for each in colors)))
+    empty = (np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)))
+    columns = [np.concatenate(parts) for parts in zip(empty, *found, strict=True)]
+    return ColorMatches(*columns, num_views=len(photos))
+
+
+def neighbouring_pairs(poses: Float[np.ndarray, "views 3 4"]) -> List[Tuple[int, int]]:
+    """Pairs of views worth matching: each with the `NEAREST_VIEWS` that look most nearly the same way."""
+    agreement = poses[:, :, 2] @ poses[:, :, 2].T
+    near = np.argsort(-agreement, axis=1)[:, : NEAREST_VIEWS + 1]
+    wanted = {(min(view, other), max(view, other)) for view in range(len(poses)) for other in near[view].tolist()}
+    return [pair for pair in combinations(range(len(poses)), 2) if pair in wanted]
+
+
+def find_keypoints(photo: Float[np.ndarray, "H W 4"], cameras: Cameras, index: int) -> Optional[_Keypoints]:
+    """SIFT keypoints of a photo with their directions in the camera; None where there are fewer than two."""
+    grey = (255.0 * (photo[..., :3] * photo[..., 3:]).mean(axis=-1)).astype(np.uint8)
+    found, descriptors = cv2.SIFT_create(nfeatures=MAX_KEYPOINTS, contrastThreshold=0.02).detectAndCompute(grey, None)
+    if len(found) < 2:
+        return None
+    points = np.array([keypoint.pt for keypoint in found])
+    pixels = float(cameras.width[index]) / photo.shape[1]
+    at = (0.5 + points) * pixels - np.array([float(cameras.cx[index]), float(cameras.cy[index])])
+    focal = np.array([float(cameras.fx[index]), float(cameras.fy[index])])
+    flat = undistorted(at / focal, cameras, index)
+    rays = np.concatenate([flat * [1.0, -1.0], -np.ones_like(flat[:, :1])], axis=-1)
+    # Square roots of the L1-normalised descriptor: Hellinger's distance (Arandjelović and Zisserman 2012).
+    descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
+    return _Keypoints(points, rays, descriptors, scale=pixels / focal.mean())
+
+
+def undistorted(points: Float[np.ndarray, "points 2"], cameras: Cameras, index: int) -> Float[np.ndarray, "points 2"]:
+    """Image points over the focal length, freed from the lens's distortion.
+
+    OpenCV's radial-tangential model with k1, k2, k3, p1 and p2; nerfstudio's k4 has no place in it.
+    """
+    if cameras.distortion_params is None:
+        return points
+    k1, k2, k3, _, p1, p2 = cameras.distortion_params[index].double().tolist()
+    return cv2.undistortPoints(points[:, None], np.eye(3), np.array([k1, k2, p1, p2, k3]))[:, 0]
+
+
+def mutual_matches(
+    first: Float[np.ndarray, "points 128"], second: Float[np.ndarray, "points 128"]
+) -> Tuple[Int[np.ndarray, "matches"], Int[np.ndarray, "matches"]]:
+    """Which unit descriptors are each other's nearest, and much nearer than the second nearest."""
+    similarity = first @ second.T
+    best = similarity.argmax(axis=1)
+    two = np.partition(similarity, -2, axis=1)[:, -2:]
+    distances = np.sqrt(np.maximum(2.0 - 2.0 * two, 0.0))
+    good = (similarity.argmax(axis=0)[best] == np.arange(len(first))) & (distances[:, 1] < MAX_RATIO * distances[:, 0])
+    return good.nonzero()[0], best[good]
+
+
+def epipolar_error(
+    first: Float[np.ndarray, "matches 3"],
+    second: Float[np.ndarray, "matches 3"],
+    pose_first: Float[np.ndarray, "3 4"],
+    pose_second: Float[np.ndarray, "3 4"],
+) -> Float[np.ndarray, "matches"]:
+    """Sampson's distance of matches from the epipolar geometry, in units of the focal length (Hartley and Zisserman,
+    Multiple View Geometry, Eq. 11.9).
+
+    Args:
+        first, second: points on the plane z = −1 of each camera.
+        pose_first, pose_second: camera to world.
+    """
+    rotation = pose_second[:, :3].T @ pose_first[:, :3]
+    x, y, z = pose_second[:, :3].T @ (pose_first[:, 3] - pose_second[:, 3])
+    essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation
+    line_second, line_first = first @ essential.T, second @ essential
+    algebraic = (second * line_second).sum(axis=-1)
+    gradient = (line_second[:, :2] ** 2).sum(axis=-1) + (line_first[:, :2] ** 2).sum(axis=-1)
+    return np.abs(algebraic) / np.sqrt(np.maximum(gradient, 1e-24))
+
+
+def sample(image: Float[np.ndarray, "H W C"], points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points C"]:
+    """Bilinear values at pixel positions (x, y), the centre of the first pixel at (0, 0)."""
+    if len(points) == 0:
+        return np.zeros((0, image.shape[-1]), dtype=image.dtype)
+    x, y = points.astype(np.float32).T
+    return cv2.remap(image, x[None], y[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]

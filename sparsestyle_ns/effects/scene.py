@@ -1,0 +1,135 @@
+"""What effects are measured on: the training photos and their cameras, and later the coarse field and the painting.
+
+Nothing is read or computed before an effect asks for it, and nothing twice.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Callable, Dict, List, Optional, Tuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from PIL import Image
+from torch import Tensor
+
+from sparsestyle_ns.effects.matches import ColorMatches, match_colors
+from sparsestyle_ns.photos import open_photo
+from sparsestyle_ns.view_selection import evenly_spaced
+
+LONGEST_SIDE = 504
+"""Pixels along the longer side at which photos are looked at."""
+BORDER = 0.02
+"""Width of a photo's border, as a part of its longer side; at least one pixel."""
+MATCHED_VIEWS = 24
+"""Photos among which points are matched; more would cost minutes and say the same."""
+SAME_COLOR = 6 / 255
+"""How far border pixels may lie from their median, in each channel, to count as one colour."""
+
+
+@dataclass
+class Scene:
+    """A scene's training views, as a dataparser gives them.
+
+    Attributes:
+        filenames: the photos.
+        cameras: their cameras.
+        scene_box: [2, 3], the dataparser's box.
+        metadata: the dataparser's.
+        alpha_color: RGB that it puts behind transparent photos; None where it doesn't.
+        coarse_density: σ_c at field coordinates, once there is a coarse field.
+        style_image: the painting, once it is known.
+    """
+
+    filenames: List[Path]
+    cameras: Cameras
+    scene_box: Float[Tensor, "2 3"]
+    metadata: Dict[str, Any]
+    alpha_color: Optional[Float[Tensor, "3"]] = None
+    coarse_density: Optional[Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]] = None
+    style_image: Optional[Float[Tensor, "3 H W"]] = None
+
+    @classmethod
+    def of(cls, outputs: DataparserOutputs) -> "Scene":
+        """The scene of a dataparser's outputs."""
+        return cls(
+            filenames=list(outputs.image_filenames),
+            cameras=outputs.cameras,
+            scene_box=outputs.scene_box.aabb,
+            metadata=outputs.metadata,
+            alpha_color=outputs.alpha_color,
+        )
+
+    @property
+    def num_views(self) -> int:
+        """Training views."""
+        return len(self.filenames)
+
+    @property
+    def camera_to_worlds(self) -> Float[np.ndarray, "views 3 4"]:
+        """The cameras' poses."""
+        return self.cameras.camera_to_worlds.double().numpy()
+
+    @property
+    def box(self) -> Tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the scene box."""
+        return tuple(self.scene_box.double().numpy())
+
+    @cached_property
+    def photos(self) -> List[Float[np.ndarray, "H W 4"]]:
+        """RGBA in [0, 1], not premultiplied, at most `LONGEST_SIDE` pixels along the longer side."""
+        return [read_rgba(path) for path in self.filenames]
+
+    @cached_property
+    def transparent(self) -> bool:
+        """Whether photos have transparency, and the dataparser a colour to put behind it."""
+        return self.alpha_color is not None and any((photo[..., 3] < 1.0).any() for photo in self.photos)
+
+    @cached_property
+    def empty_border(self) -> float:
+        """Share of all photos' border pixels that show nothing: transparent, else all of one colour."""
+        pixels = np.concatenate([border(photo) for photo in self.photos])
+        if self.transparent:
+            return float((pixels[:, 3] < 0.5).mean())
+        return float((np.abs(pixels[:, :3] - np.median(pixels[:, :3], axis=0)) <= SAME_COLOR).all(axis=-1).mean())
+
+    @cached_property
+    def background_color(self) -> List[float]:
+        """RGB behind the scene: the dataparser's for transparent photos, else the border's median."""
+        if self.transparent:
+            return [float(value) for value in self.alpha_color]
+        return np.median(np.concatenate([border(photo)[:, :3] for photo in self.photos]), axis=0).tolist()
+
+    @cached_property
+    def matches(self) -> ColorMatches:
+        """Points that are seen in two photos, with their colours there; of at most `MATCHED_VIEWS`, evenly spaced."""
+        chosen = evenly_spaced(self.num_views, MATCHED_VIEWS)
+        return match_colors([self.photos[index] for index in chosen], self.cameras[torch.tensor(chosen)])
+
+
+def read_rgba(path: Path) -> Float[np.ndarray, "H W 4"]:
+    """A photo, reduced to `LONGEST_SIDE`.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    image = open_photo(path).convert("RGBA")
+    image.thumbnail((LONGEST_SIDE, LONGEST_SIDE), Image.Resampling.BOX)
+    return np.asarray(image, dtype=np.float32) / 255.0
+
+
+def border(photo: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "pixels C"]:
+    """The pixels along a photo's four sides."""
+    height, width = photo.shape[:2]
+    inside = np.zeros((height, width), dtype=bool)
+    rim = max(1, round(BORDER * max(height, width)))
+    inside[rim:-rim, rim:-rim] = True
+    return photo[~inside]
+
+
+def foreground_colors(scene: Scene) -> Float[Tensor, "pixels 3"]:
+    """Colours of all photos' opaque pixels."""
+    return torch.from_numpy(np.concatenate([photo[photo[..., 3] > 0.5][:, :3] for photo in scene.photos]))

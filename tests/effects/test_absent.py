@@ -1,0 +1,171 @@
+"""What is off isn't there: no module, no parameter, no operation."""
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import decided
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.scene_box import SceneBox
+from torch.nn.functional import normalize
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from sparsestyle_ns.datamanager import FewShotDataManagerConfig
+from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.registry import EffectSettings
+from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig, CoarseFieldConfig
+from sparsestyle_ns.models.hier_style import HierStyleModelConfig
+from sparsestyle_ns.rendering.space import BoxSpace, ContractedSpace, ForwardFacingSpace
+
+BOX = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
+NDC = {"space": "ndc", "ndc_focal_over_half_size": [1.5, 2.0], "ndc_near": 0.7, "ndc_depth_range": [1.0, 9.0]}
+FIELD = {"num_levels": 2, "num_layers": 2, "layer_width": 16, "feature_dim": 4}
+ORANGE = {"color": [1.0, 0.5, 0.0]}
+
+
+class Operations(TorchDispatchMode):
+    """Counts the operators that torch runs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: Counter = Counter()
+
+    def __torch_dispatch__(self, function, types, arguments=(), keywords=None):
+        self.counts[str(function)] += 1
+        return function(*arguments, **(keywords or {}))
+
+
+def coarse_model(*on: str):
+    config = CoarseFewShotModelConfig(
+        coarse_field=CoarseFieldConfig(**FIELD), num_samples=6, grid_resolution=8, precision="float32"
+    )
+    metadata = {"effects": decided(*on, background=ORANGE), **NDC}
+    return config.setup(scene_box=BOX, num_train_data=3, metadata=metadata)
+
+
+def style_model(*on: str):
+    config = HierStyleModelConfig(
+        coarse_field=CoarseFieldConfig(**FIELD),
+        **{"hash_levels": 2, "min_resolution": 4, "max_resolution": 8, "log2_table_size": 8, "layer_width": 16},
+        **{"num_steps": 8, "occupancy_resolution": 4, "precision": "float32"},
+    )
+    metadata = {"effects": decided(*on, background=ORANGE), **NDC}
+    return config.setup(scene_box=BOX, num_train_data=3, metadata=metadata)
+
+
+def rays(count: int = 20) -> RayBundle:
+    generator = torch.Generator().manual_seed(0)
+    origins = torch.tensor([0.0, 0.0, 3.0]) + 0.1 * torch.randn(count, 3, generator=generator)
+    aim = 0.5 * torch.rand(count, 3, generator=generator)
+    cameras = torch.arange(count)[:, None] % 3
+    return RayBundle(origins, normalize(aim - origins, dim=-1), torch.ones(count, 1), cameras)
+
+
+def training_operations(model) -> Counter:
+    """What an iteration of stage 1 runs, forwards and backwards."""
+    model.train()
+    with Operations() as operations:
+        outputs = model.get_outputs(rays())
+        losses = model.get_loss_dict(outputs, {"image": torch.full((20, 3), 0.5)})
+        sum(losses.values()).backward()
+    return operations.counts
+
+
+def stylised_operations(model) -> Counter:
+    """What rendering and learning a stylised view runs."""
+    bundle = rays()
+    with Operations() as operations:
+        model.stylised(model.freeze(bundle.origins, bundle.directions)).rgb.sum().backward()
+    return operations.counts
+
+
+def names(model) -> set:
+    return {name for name, _ in [*model.named_modules(), *model.named_parameters(), *model.named_buffers()] if name}
+
+
+@pytest.mark.parametrize(
+    "effect, part",
+    [
+        ("view_color", "field.direction_encoding"),
+        ("exposure", "exposure"),
+        ("background", "background"),
+        ("empty_space", "grid"),
+    ],
+)
+def test_in_stage_1_an_effect_that_is_off_has_no_module_no_parameter_and_no_operation(effect, part):
+    on, off = coarse_model("box", effect), coarse_model("box")
+    assert any(name.startswith(part) for name in names(on)) and not any(name.startswith(part) for name in names(off))
+    learned = [sum(parameter.numel() for parameter in model.get_param_groups()["fields"]) for model in (on, off)]
+    assert (learned[0] > learned[1]) == (effect in ("view_color", "exposure"))
+    with_it, without = training_operations(on), training_operations(off)
+    assert without.total() < with_it.total()
+    assert not without - with_it  # and nothing else is run in its place
+
+
+@pytest.mark.parametrize("effect, part", [("residual_density", "residual.density_head"), ("empty_space", "occupancy")])
+def test_in_stage_2_an_effect_that_is_off_has_no_module_no_parameter_and_no_operation(effect, part):
+    on, off = style_model("box", effect), style_model("box")
+    assert any(name.startswith(part) for name in names(on)) and not any(name.startswith(part) for name in names(off))
+    with_it, without = stylised_operations(on), stylised_operations(off)
+    assert without.total() < with_it.total()
+    assert not without - with_it
+
+
+def test_photos_exposures_are_frozen_in_stage_2():
+    model = style_model("box", "exposure")
+    assert not model.exposure.log_gain.requires_grad
+    assert not style_model("box").state_dict().keys() & {"exposure.log_gain"}
+
+
+@pytest.mark.parametrize(
+    "layout, kind", [("ndc", ForwardFacingSpace), ("box", BoxSpace), ("contraction", ContractedSpace)]
+)
+def test_the_layout_that_is_on_is_the_only_one_built(layout, kind):
+    model = coarse_model(layout)
+    spaces = [
+        module for module in model.modules() if isinstance(module, ForwardFacingSpace | BoxSpace | ContractedSpace)
+    ]
+    assert [type(space) for space in spaces] == [kind]
+    assert torch.isfinite(model.get_outputs(rays())["rgb"]).all()
+
+
+def test_contraction_costs_operations_that_a_box_doesnt():
+    assert training_operations(coarse_model("box")).total() < training_operations(coarse_model("contraction")).total()
+
+
+def test_ndc_is_built_with_the_dataparsers_numbers():
+    space = coarse_model("ndc").space
+    assert (space.focal_over_half_size, space.near) == ((1.5, 2.0), 0.7)
+
+
+def test_without_lens_distortion_no_ray_is_undistorted(tmp_path: Path):
+    import make_sample_scene
+
+    options = ["--layout", "nerfstudio", "--width", "16", "--num-views", "9", "--supersample", "1"]
+    make_sample_scene.main([str(tmp_path / "bent"), *options, "--distortion", "0.1"])
+    make_sample_scene.main([str(tmp_path / "straight"), *options])
+
+    def operations(name: str, choice: str) -> Counter:
+        config = FewShotDataManagerConfig(
+            data=tmp_path / name / "nerfstudio",
+            dataparser=NerfstudioDataParserConfig(),
+            effects=EffectSettings(lens_distortion=choice),
+        )
+        manager = config.setup(device="cpu", test_mode="inference")
+        for dataset in (manager.train_dataset, manager.eval_dataset):
+            assert (dataset.cameras.distortion_params is None) == (choice == "off")
+        with Operations() as counted:
+            manager.train_dataset.cameras.generate_rays(camera_indices=0, keep_shape=True)
+        return counted.counts
+
+    bent, off = operations("bent", "on"), operations("bent", "off")
+    assert off == operations("straight", "off")
+    assert off.total() < bent.total()
+
+
+@pytest.mark.parametrize("name", ["background", "exposure", "view_color", "empty_space", "palette", "lens_distortion"])
+def test_what_is_off_builds_nothing_and_asks_for_nothing(name):
+    decisions: Decisions = decided("box")
+    assert decisions.build(name) is None

@@ -1,0 +1,123 @@
+"""What effects measure, against cases worked out by hand."""
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
+
+from sparsestyle_ns.effects.exposure import fit_gains
+from sparsestyle_ns.effects.layouts import meeting_point, viewing_spread
+from sparsestyle_ns.effects.lens_distortion import largest_shift
+from sparsestyle_ns.effects.matches import ColorMatches, epipolar_error, mutual_matches, sample
+from sparsestyle_ns.effects.scene import border, read_rgba
+from sparsestyle_ns.errors import InputError
+
+
+def camera_at(position, back) -> np.ndarray:
+    """A camera, upright, with this vector pointing backwards out of it."""
+    back = np.asarray(back, float) / np.linalg.norm(back)
+    right = np.cross([0.0, 1.0, 0.0], back)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back, np.asarray(position, float)], axis=-1)
+
+
+def test_the_spread_of_viewing_directions_is_the_largest_angle_from_their_mean():
+    pair = np.stack([camera_at((0, 0, 0), (np.sin(a), 0, np.cos(a))) for a in np.radians([-30, 30])])
+    assert viewing_spread(pair) == pytest.approx(30)
+    assert viewing_spread(pair[:1]) == pytest.approx(0, abs=1e-5)
+    opposite = np.stack([camera_at((0, 0, 0), (0, 0, z)) for z in (1, -1)])
+    assert viewing_spread(opposite) == 180
+
+
+def test_cameras_around_a_point_meet_there():
+    point = np.array([0.3, -0.2, 0.5])
+    backs = np.array([[1.0, 0.1, 0.2], [-0.4, 0.3, 1.0], [0.2, -0.5, -1.0]])
+    cameras = np.stack([camera_at(point + 3 * back, back) for back in backs])
+    assert meeting_point(cameras) == pytest.approx(point)
+
+
+def test_a_true_match_obeys_the_cameras_and_a_shifted_one_is_off_by_the_shift():
+    poses = camera_at((-1, 0, 0), (0, 0, 1)), camera_at((1, 0, 0), (0, 0, 1))
+    points = np.random.default_rng(0).uniform((-1, -1, -6), (1, 1, -3), (20, 3))
+
+    def seen(pose):
+        local = (points - pose[:, 3]) @ pose[:, :3]
+        return local / -local[:, 2:]
+
+    first, second = seen(poses[0]), seen(poses[1])
+    assert epipolar_error(first, second, *poses) == pytest.approx(np.zeros(20), abs=1e-9)
+    # Beside each other, cameras allow any shift sideways and none upwards; Sampson shares it between both photos.
+    assert epipolar_error(first, second + np.array([0.1, 0, 0]), *poses) == pytest.approx(np.zeros(20), abs=1e-9)
+    assert epipolar_error(first, second + np.array([0, 0.1, 0]), *poses) == pytest.approx(np.full(20, 0.1 / np.sqrt(2)))
+
+
+def test_only_the_nearest_neighbours_of_each_other_match_and_only_where_they_stand_out():
+    first = np.eye(4)[:3]
+    second = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0.02, 0, 0.7, 0.71], [0, 0, 0.71, 0.7]])
+    here, there = mutual_matches(first, second / np.linalg.norm(second, axis=1, keepdims=True))
+    assert (here.tolist(), there.tolist()) == ([0, 1], [1, 0])
+
+
+def test_colours_are_sampled_at_pixel_centres_and_between_them():
+    image = np.arange(12, dtype=np.float32).reshape(3, 4)[..., None] * np.array([1, 10], dtype=np.float32)
+    found = sample(image, np.array([[1.0, 2.0], [1.5, 0.0], [0.0, 0.5]]))
+    assert found.tolist() == [[9.0, 90.0], [1.5, 15.0], [2.0, 20.0]]
+
+
+def colour_matches(gains, outliers: int = 0) -> ColorMatches:
+    """A hundred grey points in each pair of photos with these gains, some of them of another colour in one."""
+    generator = np.random.default_rng(1)
+    views, columns = len(gains), [[], [], [], []]
+    for first in range(views):
+        for second in range(first + 1, views):
+            colors = generator.uniform(0.3, 0.6, (100, 3))
+            other = colors * gains[second]
+            other[:outliers] = generator.uniform(0, 1, (outliers, 3))
+            for column, part in zip(columns, (first, second, colors * gains[first], other), strict=True):
+                column.append(np.full(100, part) if np.isscalar(part) else part)
+    return ColorMatches(*(np.concatenate(column) for column in columns), num_views=views)
+
+
+@pytest.mark.parametrize("outliers", [0, 20])
+def test_gains_are_found_up_to_their_mean_even_among_points_that_differ(outliers):
+    gains = np.exp(np.array([[0.3, 0.2, 0.1], [-0.2, 0.0, 0.1], [0.1, -0.1, 0.0]]))
+    found, unexplained = fit_gains(colour_matches(gains, outliers))
+    expected = np.log(gains) - np.log(gains).mean(axis=0)
+    # 0.02 is added to colours of about 0.45 before their ratio is taken, which takes 4% off.
+    assert np.abs(found - expected).max() < 0.03
+    assert np.median(np.abs(unexplained)) < 0.02
+
+
+def test_photos_that_hang_together_by_nothing_have_no_measurable_gain():
+    whole = colour_matches(np.ones((4, 3)))
+    assert whole.fewest_in_a_view() == 300
+    apart = (whole.first < 2) == (whole.second < 2)
+    parts = (getattr(whole, name)[apart] for name in ("first", "second", "colors_first", "colors_second"))
+    assert ColorMatches(*parts, num_views=4).fewest_in_a_view() == 0
+
+
+def lens(k1: float) -> Cameras:
+    pose = torch.eye(4)[None, :3]
+    distortion = torch.tensor([[k1, 0, 0, 0, 0, 0]])
+    return Cameras(pose, 100.0, 100.0, 50.0, 40.0, 100, 80, distortion_params=distortion)
+
+
+def test_the_shift_by_a_lens_is_that_of_the_corner():
+    seen = np.hypot(0.5, 0.4)
+    flat = np.roots([0.1, 0, 1, -seen])
+    flat = flat[np.isreal(flat)].real[0]
+    # OpenCV inverts the lens by a few fixed-point steps.
+    assert largest_shift(lens(0.1)) == pytest.approx(100 * (seen - flat), rel=1e-2)
+    assert largest_shift(lens(0.0)) == 0
+
+
+def test_the_border_of_a_photo_is_its_rim():
+    photo = np.zeros((50, 100, 1))
+    photo[2:-2, 2:-2] = 1
+    assert len(border(photo)) == 2 * 2 * 100 + 2 * 2 * 46 and border(photo).max() == 0
+
+
+def test_a_photo_that_cant_be_read_is_named(tmp_path):
+    (tmp_path / "photo.png").write_text("no picture")
+    with pytest.raises(InputError, match=r"photo\.png"):
+        read_rgba(tmp_path / "photo.png")
