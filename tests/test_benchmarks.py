@@ -11,7 +11,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))  # benchmarks isn't in
 
 from nerfstudio.data.scene_box import SceneBox
 
-from benchmarks import _measure, _scene, nnfm, stability, stage1, summary
+from benchmarks import _measure, _scene, effects, nnfm, stability, stage1, summary
 from benchmarks._measure import Duration, Options, Ratio, Report
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.field_components.hash_grid import HashGrid
@@ -327,6 +327,17 @@ def test_vanilla_nerf_is_made_without_a_network_and_with_its_own_settings(llff_s
     before = [parameter.clone() for parameter in pipeline.model.parameters()]
     contender.step()
     assert any(not torch.equal(old, new) for old, new in zip(before, pipeline.model.parameters(), strict=True))
+
+
+def test_effects_are_timed_with_and_without_each_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(effects, "CACHE", tmp_path / "cache")
+    only = ("exposure", "lens_distortion", "residual_density", "palette")
+    effects.main(effects.EffectOptions(quick=True, repeats=1, device="cpu", output_dir=tmp_path, only=only))
+    content = json.loads((tmp_path / "effects.json").read_text())
+    assert tuple(row["name"] for row in content["rows"]) == only
+    assert all(row["with_over_without"] > 0 for row in content["rows"])
+    with pytest.raises(SystemExit, match="shadow"):
+        effects.main(effects.EffectOptions(device="cpu", output_dir=tmp_path, only=("shadow",)))
 
 
 def test_a_benchmark_can_be_run_as_a_command(tmp_path):

@@ -84,5 +84,5 @@ def held_out_psnr(folder: Path, layout: str, steps: int, effects: Dict[str, str]
 )
 def test_an_effect_that_a_scene_calls_for_makes_held_out_views_better(scenes, layout, options, on, off):
     folder = scenes(layout, *options)
-    with_it, without = (held_out_psnr(folder, layout, 400, effects) for effects in (on, off))
+    with_it, without = (held_out_psnr(folder, layout, 300, effects) for effects in (on, off))
     assert with_it > without
