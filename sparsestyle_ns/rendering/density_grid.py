@@ -29,8 +29,9 @@ def interval_lengths(
 
 def grid_cells(positions: Float[Tensor, "*batch 3"], resolution: int) -> Int[Tensor, "*batch 3"]:
     """Indices of the cells of the cube [−1, 1]³ that positions lie in; outside of it the nearest cell's."""
-    # Cut off before they become integers, which have no numbers for the farthest points.
-    return ((0.5 * positions + 0.5) * resolution).clamp(0, resolution - 1).long()
+    # Cut off before they become integers, which have no numbers for the farthest points. What is no number gets the
+    # first cell: an index out of bounds would end the process on a GPU before anyone could say where it came from.
+    return ((0.5 * positions + 0.5) * resolution).clamp(0, resolution - 1).long().clamp_(min=0)
 
 
 class DensityGrid(nn.Module):

@@ -96,7 +96,7 @@ def test_transparent_pixels_do_not_count():
 
 @hard_case(
     "palette",
-    case="16 million pixels that differ in the eighth digit",
+    case="a million pixels that differ in the eighth digit",
     could_go_wrong="mean square minus squared mean cancels: a negative variance",
     must_hold="the variance is that of the differences, to three digits",
 )
