@@ -64,7 +64,7 @@ def test_stage_1_on_two_processes_is_stage_1_on_one(llff_scene, tmp_path):
     "two processes",
     case="stage 2 on two processes: whole views, rendered in shares, after a warm start",
     could_go_wrong="gradients of half a picture, or half the gradient; different starts; each process its own view",
-    must_hold="the picture of one process with the same settings, to 1% of what stylising has changed in it",
+    must_hold="the picture of one process with the same settings, to 0.2% of what stylising has changed in it",
 )
 def test_stage_2_on_two_processes_is_stage_2_on_one(runs, llff_scene, painting, tmp_path):
     # Weights alone say less: Adam moves one whose gradient is only rounding by as much as any other.
@@ -74,7 +74,7 @@ def test_stage_2_on_two_processes_is_stage_2_on_one(runs, llff_scene, painting, 
     one, two = (picture(only_run(tmp_path / name, "hier-style")) for name in ("one", "two"))
     error = (two["rgb"] - one["rgb"]).square().mean().sqrt()
     changed = (one["rgb"] - one["rgb_coarse"]).square().mean().sqrt()
-    assert error <= 0.01 * changed, f"{error} of {changed}"
+    assert error <= 0.002 * changed, f"{error} of {changed}"
 
 
 @hard_case(
