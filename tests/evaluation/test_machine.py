@@ -20,6 +20,7 @@ def test_own_work_is_not_load_by_others():
             patch.setattr(machine.os, "times", lambda: own)
 
         patch.setattr(machine.os, "cpu_count", lambda: 2)
+        patch.setattr(machine.psutil, "cpu_percent", lambda interval: 4.0)
         set_now(0.0, 0.0, 0.0)
         load = machine.OtherLoad()
         # Ten seconds of two cores: 12 s are ours, 5 s are idle, and 3 s are another process'.

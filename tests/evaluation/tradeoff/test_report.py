@@ -95,7 +95,7 @@ def test_a_knob_is_named_as_ns_train_names_it():
     assert knob.flag == "--pipeline.model.coarse-field.layer-width"
     changed = with_setting(config, knob.path, 64)
     assert (knob.read(changed), knob.read(config)) == (64, 256)
-    with pytest.raises(AttributeError, match="no pipeline.model.no_such"):
+    with pytest.raises(AttributeError, match=r"no pipeline\.model\.no_such"):
         with_setting(config, "pipeline.model.no_such", 1)
 
 
@@ -198,7 +198,7 @@ def test_a_report_without_a_single_figure_is_written_too(tmp_path):
 
 def test_a_folder_that_can_not_be_written_to_is_said_in_one_sentence(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="can't be written to .*file.*; name another --output-dir"):
+    with pytest.raises(InputError, match=r"can't be written to .*file.*; name another --output-dir"):
         make_report().write(tmp_path / "file")
 
 
