@@ -10,7 +10,8 @@ import torch
 import tyro
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
+from rich.progress_bar import ProgressBar
 
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.machine import device_name, versions
@@ -28,6 +29,8 @@ from sparsestyle_ns.evaluation.tradeoff.study import Options, Study, quiet
 REPORT_SECONDS = 4.0
 REPORT_SHARE = 0.05
 """Time that is kept for writing the report: so many seconds, but no larger part of the budget."""
+REFRESHES = 2
+"""Of the progress bar in a second; drawing it takes time from what is measured."""
 MARKERS = {
     "poses_bounds.npy": "llff-data",
     "transforms_train.json": "blender-data",
@@ -115,18 +118,25 @@ def _check_folder(folder: Path) -> None:
         raise cant_write(folder, error) from error
 
 
+class TimeColumn(ProgressColumn):
+    """A bar of the time that has been spent."""
+
+    def __init__(self, budget: Budget) -> None:
+        super().__init__()
+        self.budget = budget
+
+    def render(self, task: Task) -> ProgressBar:
+        """The bar as it is now."""
+        total = self.budget.end - self.budget.start
+        return ProgressBar(total=total, completed=min(total, self.budget.spent), width=40)
+
+
 @contextmanager
 def _progress(console: Console, budget: Budget) -> Iterator[Callable[[Axis], None]]:
-    """A bar of the time that has passed, with what is being measured."""
-
-    class SpentColumn(BarColumn):
-        def render(self, task: Any) -> Any:
-            task.completed = min(task.total, budget.spent)
-            return super().render(task)
-
-    columns = (TextColumn("{task.description}"), SpentColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("loading the scene", total=budget.end - budget.start)
+    """Shows how much of the time has passed, and what is being measured."""
+    columns = (TimeColumn(budget), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console, transient=True, refresh_per_second=REFRESHES) as progress:
+        task = progress.add_task("loading the scene", total=None)
         yield lambda axis: progress.update(task, description=f"{axis.group}: {axis.title}")
 
 
@@ -158,7 +168,10 @@ def facts(study: Study, seconds: float, spent: float) -> dict[str, Any]:
 def run(options: Options, seconds: float) -> None:
     """Measures, writes the report, and prints the recommendation."""
     console = Console()
-    report = measure(options, Budget(seconds), console)
+    try:
+        report = measure(options, Budget(seconds), console)
+    except KeyboardInterrupt:
+        raise SystemExit("Stopped before anything was measured.") from None
     page = report.write(options.output_dir)
 
     def say(*lines: str) -> None:

@@ -131,7 +131,8 @@ def page(report: Report) -> str:
     title = f"What accuracy costs in time: {report.scene}"
     lines = "".join(f"<li>{escape(line)}</li>" for line in report.recommendation)
     facts = "".join(
-        f"<div><dt>{escape(name)}</dt><dd>{escape(words_of(value))}</dd></div>" for name, value in report.facts.items()
+        f"<div><dt>{escape(name.replace('_', ' '))}</dt><dd>{escape(words_of(value))}</dd></div>"
+        for name, value in report.facts.items()
     )
     left_out = "".join(f"<li>{escape(line)}</li>" for line in report.everything_left_out())
     sections = "".join(_group(name, title, report.measured) for name, title in GROUPS.items())

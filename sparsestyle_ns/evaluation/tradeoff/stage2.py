@@ -1,5 +1,6 @@
 """Stage 2: style and content loss of held-out views, against the time of a run, of an iteration, and memory."""
 
+import gc
 from dataclasses import dataclass, field
 from typing import Dict, List, Optional, Sequence, Tuple
 
@@ -126,6 +127,7 @@ class Stage2:
     def _run(self, config: TrainerConfig, budget: Budget, seed: int) -> Run:
         study, run = self.study, Run()
         assert self._iterations is not None
+        gc.collect()  # what is left of the run before would count as this one's memory
         training = study.start(squeezed(config, self._iterations), seed)
         reserve = len(study.views) * study.style_view_seconds
         stops = stops_of(self._iterations, SHORT_STOPS)

@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-import gc
 import math
 import threading
 import warnings
@@ -132,7 +131,6 @@ class PeakMemory:
         self.bytes = 0
 
     def __enter__(self) -> "PeakMemory":
-        gc.collect()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._look, daemon=True)
         if self.device.type == "cuda":

@@ -38,6 +38,7 @@ OVERRIDES = {
         "pipeline.model.hash_levels": 2,
         "pipeline.model.log2_table_size": 10,
         "pipeline.model.num_steps": 8,
+        "pipeline.model.layer_width": 16,
         "pipeline.model.occupancy_resolution": 8,
         "pipeline.model.bake_resolution": 32,
         "pipeline.model.precision": "float32",
