@@ -10,11 +10,9 @@ from sparsestyle_ns.evaluation.tradeoff.budget import Budget, OutOfTimeError
 from sparsestyle_ns.evaluation.tradeoff.plan import Plan
 from sparsestyle_ns.evaluation.tradeoff.study import Study, squeezed
 
-LONG_STOPS = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1)
+LONG_STOPS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1)
 SHORT_STOPS = (1 / 4, 1 / 2, 1)
 """Shares of a run at which it is evaluated."""
-EVALUATION_SHARE = 0.25
-"""Part of a short run's time that evaluating may take; how many views are looked at follows from it."""
 MIN_ITERATIONS = 3
 PLOTS = [("train_seconds", "psnr"), ("train_seconds", "ssim")]
 
@@ -44,7 +42,7 @@ class Stage1:
         )
         self._presets: Dict[int, Moments] = {}
         self._seconds: Optional[float] = None
-        self._views: Sequence[int] = study.views
+        self._views: List[int] = []
 
     def long_plan(self) -> Plan:
         """The long run."""
@@ -65,36 +63,44 @@ class Stage1:
             plans.append(Plan(axis, 3.5 * runs, lambda axis, budget, knob=knob: self._short(axis, knob, budget)))
         return plans
 
-    def _iterations(self, config: TrainerConfig, budget: Budget, evaluations: int, views: Sequence[int]) -> int:
-        """How many iterations fit, besides evaluating so many times; from a few of them."""
+    def _step_seconds(self, config: TrainerConfig, budget: Budget) -> float:
+        """Seconds of an iteration, from a few; makes sure that the time of a held-out view is known."""
         probe = self.study.start(config)
-        step = self.study.step_seconds(probe, budget)
-        self.study.evaluate_coarse(probe.pipeline.model, views[:1])
-        left = budget.left - evaluations * len(views) * self.study.coarse_view_seconds
-        return min(config.max_num_iterations, max(MIN_ITERATIONS, int(left / step)))
+        seconds = self.study.step_seconds(probe, budget)
+        if not self.study.coarse_view_seconds:
+            self.study.evaluate_coarse(probe.pipeline.model, self.study.views[:1])
+        return seconds
 
     def _long(self, axis: Axis, budget: Budget) -> None:
         study, config = self.study, self.study.coarse_config
-        iterations = self._iterations(config, budget, len(LONG_STOPS), study.views)
+        step = self._step_seconds(config, budget)
+        views = study.views_that_fit(budget, len(LONG_STOPS), study.coarse_view_seconds)
+        iterations = self._fitting(config, step, budget, len(LONG_STOPS), len(views))
         axis.note = (
             f"One run of {config.method_name}, its schedules fitted to {iterations} iterations (the preset has "
-            f"{config.max_num_iterations}); means over {len(study.views)} held-out views. The clock stands still while "
-            "they are evaluated."
+            f"{config.max_num_iterations}); mean over {len(views)} held-out views. The clock stands still while they "
+            "are evaluated."
         )
         training = study.start(squeezed(config, iterations))
         model = training.pipeline.model
-        reserve = len(study.views) * study.coarse_view_seconds
+        reserve = len(views) * study.coarse_view_seconds
         for checkpoint in study.train(training, stops_of(iterations, LONG_STOPS), budget, reserve):
             if study.options.coarse_run is None:
                 study.keep_coarse(model)
-            values = {"train_seconds": checkpoint.seconds, **study.evaluate_coarse(model)}
+            values = {"train_seconds": checkpoint.seconds, **study.evaluate_coarse(model, views)}
             axis.add(checkpoint.iterations, values, checkpoint.busy)
+
+    def _fitting(self, config: TrainerConfig, step: float, budget: Budget, stops: int, views: int) -> int:
+        """How many iterations fit, besides evaluating."""
+        left = budget.left - stops * views * self.study.coarse_view_seconds
+        return min(config.max_num_iterations, max(MIN_ITERATIONS, int(left / step)))
 
     def _run(self, config: TrainerConfig, budget: Budget, seed: int) -> Moments:
         study = self.study
-        if seed == 0 and not self._presets:
-            self._choose_views(budget)
-        iterations = self._iterations(config, budget, len(SHORT_STOPS), self._views)
+        step = self._step_seconds(config, budget)
+        if not self._views:
+            self._views = study.views_that_fit(budget, len(SHORT_STOPS), study.coarse_view_seconds)
+        iterations = self._fitting(config, step, budget, len(SHORT_STOPS), len(self._views))
         training = study.start(squeezed(config, iterations), seed)
         moments: Moments = []
         reserve = len(self._views) * study.coarse_view_seconds
@@ -108,11 +114,6 @@ class Stage1:
             if not moments:
                 raise
         return moments
-
-    def _choose_views(self, budget: Budget) -> None:
-        seconds = max(self.study.coarse_view_seconds, 1e-9) * len(SHORT_STOPS)
-        count = int(EVALUATION_SHARE * budget.left / seconds)
-        self._views = self.study.views[: max(1, count)]
 
     def _short(self, axis: Axis, knob: Knob, budget: Budget) -> None:
         study = self.study

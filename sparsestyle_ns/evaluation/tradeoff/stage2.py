@@ -55,6 +55,7 @@ class Stage2:
         )
         self._presets: Dict[int, Run] = {}
         self._iterations: Optional[int] = None
+        self._views: List[int] = []
         self._costs = Costs()
 
     def long_plan(self) -> Plan:
@@ -98,30 +99,35 @@ class Stage2:
             raise OutOfTimeError
         return self.study.adapted_style_config()
 
-    def _fitting_iterations(self, config: TrainerConfig, budget: Budget, evaluations: int) -> int:
-        """How many iterations fit into the budget of a run, besides preparing it and evaluating it."""
+    def _plan_run(self, config: TrainerConfig, budget: Budget, stops: int) -> Tuple[int, List[int]]:
+        """How many iterations fit into the budget of a run, and the held-out views to look at."""
         study = self.study
-        setup, probe = study.timed(lambda: study.start(with_setting(config, "pipeline.warm_start_steps", 0)))
-        budget.check(setup)
+        cold = with_setting(config, "pipeline.warm_start_steps", 0)
+        if not study.frozen:
+            study.start(cold)  # freezes the views, once for all runs
+            budget.check()
+        setup, probe = study.timed(lambda: study.start(cold))
         step = study.step_seconds(probe, budget)
-        study.evaluate_style(probe.pipeline.model, study.views[:1])
-        left = budget.left - setup - evaluations * len(study.views) * study.style_view_seconds
-        return min(config.max_num_iterations, max(MIN_ITERATIONS, int(WARM_START_SHARE * left / step)))
+        if not study.style_view_seconds:
+            study.evaluate_style(probe.pipeline.model, study.views[:1])
+        views = study.views_that_fit(budget, stops, study.style_view_seconds)
+        left = budget.left - setup - stops * len(views) * study.style_view_seconds
+        return min(config.max_num_iterations, max(MIN_ITERATIONS, int(WARM_START_SHARE * left / step))), views
 
     def _long(self, axis: Axis, budget: Budget) -> None:
         study, config = self.study, self._config(budget)
-        iterations = self._fitting_iterations(config, budget, len(LONG_STOPS) - 1)
+        iterations, views = self._plan_run(config, budget, len(LONG_STOPS))
         axis.note = (
             f"One run of {config.method_name}, its schedules fitted to {iterations} iterations (the preset has "
-            f"{config.max_num_iterations}); means over {len(study.views)} held-out views. The clock stands still while "
-            "they are evaluated, and doesn't run during preparation and warm start."
+            f"{config.max_num_iterations}); mean over {len(views)} held-out views. The clock stands still while they "
+            "are evaluated, and doesn't run during preparation and warm start."
         )
         training = study.start(squeezed(config, iterations))
         model = training.pipeline.model
         study.keep_style(model)
-        reserve = len(study.views) * study.style_view_seconds
-        for checkpoint in study.train(training, stops_of(iterations, LONG_STOPS[1:]), budget, reserve):
-            values = {"train_seconds": checkpoint.seconds, **study.evaluate_style(model)}
+        reserve = len(views) * study.style_view_seconds
+        for checkpoint in study.train(training, stops_of(iterations, LONG_STOPS), budget, reserve):
+            values = {"train_seconds": checkpoint.seconds, **study.evaluate_style(model, views)}
             axis.add(checkpoint.iterations, values, checkpoint.busy)
 
     def _run(self, config: TrainerConfig, budget: Budget, seed: int) -> Run:
@@ -129,7 +135,7 @@ class Stage2:
         assert self._iterations is not None
         gc.collect()  # what is left of the run before would count as this one's memory
         training = study.start(squeezed(config, self._iterations), seed)
-        reserve = len(study.views) * study.style_view_seconds
+        reserve = len(self._views) * study.style_view_seconds
         stops = stops_of(self._iterations, SHORT_STOPS)
         checkpoints = study.train(training, stops, budget, reserve, run.steps)
         for number in range(len(stops)):
@@ -139,7 +145,7 @@ class Stage2:
                 raise OutOfTimeError  # fewer iterations than the others have can't be set beside them
             run.memory = max(run.memory, memory.bytes)
             values: Values = {"train_seconds": checkpoint.seconds, "iterations": checkpoint.iterations}
-            values.update(study.evaluate_style(training.pipeline.model))
+            values.update(study.evaluate_style(training.pipeline.model, self._views))
             run.moments.append((f"stop {number + 1}", values, checkpoint.busy))
         return run
 
@@ -150,7 +156,7 @@ class Stage2:
         try:
             if self._iterations is None:
                 part = budget.part(budget.left / (len(values) + 0.5))
-                self._iterations = self._fitting_iterations(config, part, len(SHORT_STOPS))
+                self._iterations, self._views = self._plan_run(config, part, len(SHORT_STOPS))
             for round_ in range(study.options.rounds):
                 for value in values:
                     run = self._presets.get(round_) if value == preset else None
@@ -167,8 +173,8 @@ class Stage2:
             axis.left_out += [f"{value}: no time was left" for value in values if axis.last(value) is None]
             if self._iterations is not None:
                 axis.note = (
-                    f"One run of {self._iterations} iterations for each value, schedules fitted to them; means over "
-                    f"{len(study.views)} held-out views, with the preset's features and painting for all."
+                    f"One run of {self._iterations} iterations for each value, schedules fitted to them; mean over "
+                    f"{len(self._views)} held-out views, with the preset's features and painting for all."
                 )
 
     def _add(self, axis: Axis, value: object, run: Run) -> None:

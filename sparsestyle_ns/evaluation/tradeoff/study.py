@@ -7,7 +7,7 @@ import threading
 import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, Iterator, List, Optional, Sequence, Tuple, Type
 
 import psutil
 import rich
@@ -28,13 +28,17 @@ from sparsestyle_ns.evaluation.tradeoff.pareto import root_mean_square
 from sparsestyle_ns.evaluation.training import Training
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
-from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
+from sparsestyle_ns.models.hier_style import HierStyleModel
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig
+from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.scene_record import record_scene
 from sparsestyle_ns.style.targets import StyleTargets
 from sparsestyle_ns.view_selection import evenly_spaced
 
 HELD_OUT_VIEWS = 3
 """Held-out views that are measured at most; evenly spaced among all."""
+EVALUATION_SHARE = 0.3
+"""Part of a run's time that evaluating it may take; how many views are looked at follows from it."""
 PROBE_STEPS = 3
 """Iterations from which the time of one is estimated, after one that doesn't count."""
 
@@ -83,6 +87,25 @@ class SharedManager:
     def setup(self, **kwargs: Any) -> Any:
         """The data manager."""
         return self.manager
+
+
+def sharing_pipeline(frozen: Dict[int, FrozenView]) -> Type[HierStylePipeline]:
+    """A stage-2 pipeline whose views are frozen once for all runs on the same coarse field and photos.
+
+    Args:
+        frozen: where they are kept, by the address of the view's rays.
+    """
+
+    class SharingPipeline(HierStylePipeline):
+        """See `sharing_pipeline`."""
+
+        def _freeze(self, origins: Tensor, directions: Tensor, keep_bytes: float) -> FrozenView:
+            key = origins.data_ptr()
+            if key not in frozen:
+                frozen[key] = super()._freeze(origins, directions, keep_bytes)
+            return frozen[key]
+
+    return SharingPipeline
 
 
 @contextlib.contextmanager
@@ -207,6 +230,7 @@ class Study:
         self.own_error: Optional[float] = None
         self.style_model: Optional[HierStyleModel] = None
         self.is_stylised = False
+        self.frozen: Dict[int, FrozenView] = {}
         self.coarse_view_seconds = self.style_view_seconds = 0.0
         if options.coarse_run is not None:
             self._adopt_coarse_run(options.coarse_run)
@@ -285,7 +309,9 @@ class Study:
             config.pipeline.model.seed += seed
         config.pipeline.datamanager.seed += seed
         config.pipeline.datamanager = self._shared(config)
-        state = self.coarse_state if isinstance(config.pipeline.model, HierStyleModelConfig) else None
+        state = None
+        if isinstance(config.pipeline, HierStylePipelineConfig):
+            state, config.pipeline._target = self.coarse_state, sharing_pipeline(self.frozen)
         return Training(config, self.device, state)
 
     def adapted_style_config(self) -> TrainerConfig:
@@ -348,6 +374,11 @@ class Study:
 
     # --------------------------------------------------------------------------------------------------- evaluation
 
+    def views_that_fit(self, budget: Budget, stops: int, view_seconds: float) -> List[int]:
+        """The held-out views to look at so many times in a run: as many as there is time for, at least one."""
+        count = int(EVALUATION_SHARE * budget.left / max(stops * view_seconds, 1e-9))
+        return self.views[: max(1, count)]
+
     @torch.no_grad()
     def evaluate_coarse(self, model: CoarseFewShotModel, views: Optional[Sequence[int]] = None) -> Dict[str, float]:
         """Mean PSNR in dB and SSIM of held-out views; notes what a view takes and the kept field's error."""
@@ -357,6 +388,7 @@ class Study:
             image_metrics(model.get_outputs_for_camera(self.camera(view))["rgb"], self.photos[view]) for view in views
         ]
         synchronize(self.device)
+        self.frozen: Dict[int, FrozenView] = {}
         self.coarse_view_seconds = (self.clock() - start) / len(views)
         means = {name: sum(one[name] for one in found) / len(found) for name in ("psnr", "ssim")}
         if model is self.coarse_model:
