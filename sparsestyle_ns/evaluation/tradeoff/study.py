@@ -39,6 +39,8 @@ HELD_OUT_VIEWS = 3
 """Held-out views that are measured at most; evenly spaced among all."""
 EVALUATION_SHARE = 0.3
 """Part of a run's time that evaluating it may take; how many views are looked at follows from it."""
+LOADING_SHARE = 0.05
+"""Part of all time that evaluating a coarse run may take before anything is measured; else one view stands for all."""
 PROBE_STEPS = 3
 """Iterations from which the time of one is estimated, after one that doesn't count."""
 
@@ -253,7 +255,9 @@ class Study:
         model = self._setup_pipeline(self._with_model(run.config.pipeline.model)).model
         model.load_state_dict(run.model_state())
         self.keep_coarse(model)
-        self.evaluate_coarse(model)
+        self.evaluate_coarse(model, self.views[:1])
+        if self.coarse_view_seconds * len(self.views) < LOADING_SHARE * self.budget.left:
+            self.evaluate_coarse(model)
 
     def _with_model(self, model_config: Any) -> TrainerConfig:
         config = copy.deepcopy(self.coarse_config)
@@ -388,7 +392,6 @@ class Study:
             image_metrics(model.get_outputs_for_camera(self.camera(view))["rgb"], self.photos[view]) for view in views
         ]
         synchronize(self.device)
-        self.frozen: Dict[int, FrozenView] = {}
         self.coarse_view_seconds = (self.clock() - start) / len(views)
         means = {name: sum(one[name] for one in found) / len(found) for name in ("psnr", "ssim")}
         if model is self.coarse_model:
