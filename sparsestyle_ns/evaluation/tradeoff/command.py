@@ -1,5 +1,6 @@
 """`sparsestyle tradeoff`: measures all axes within a budget and writes the report, also when it is stopped."""
 
+import gc
 import tempfile
 from contextlib import contextmanager
 from datetime import datetime, timezone
@@ -75,6 +76,8 @@ def measure(options: Options, budget: Budget, console: Console) -> Report:
             run_plans(plans, budget.part(budget.left - reserve), begin)
         except KeyboardInterrupt:
             stopped = ["Stopped by Ctrl-C; what was measured before is here."]
+        finally:
+            gc.unfreeze()
     axes = [plan.axis for plan in plans if plan.axis.points or plan.axis.left_out]
     return Report(scene_in_words(study), facts(study, seconds, budget.spent), axes, [*stopped, *left_out])
 

@@ -1,6 +1,5 @@
 """Stage 2: style and content loss of held-out views, against the time of a run, of an iteration, and memory."""
 
-import gc
 from dataclasses import dataclass, field
 from typing import Dict, List, Optional, Sequence, Tuple
 
@@ -103,7 +102,7 @@ class Stage2:
         """How many iterations fit into the budget of a run, and the held-out views to look at."""
         study = self.study
         cold = with_setting(config, "pipeline.warm_start_steps", 0)
-        if not study.frozen:
+        if not study.shared.frozen:
             study.start(cold)  # freezes the views, once for all runs
             budget.check()
         setup, probe = study.timed(lambda: study.start(cold))
@@ -133,7 +132,7 @@ class Stage2:
     def _run(self, config: TrainerConfig, budget: Budget, seed: int) -> Run:
         study, run = self.study, Run()
         assert self._iterations is not None
-        gc.collect()  # what is left of the run before would count as this one's memory
+        study.collect_garbage()  # what is left of the run before would count as this one's memory
         training = study.start(squeezed(config, self._iterations), seed)
         reserve = len(self._views) * study.style_view_seconds
         stops = stops_of(self._iterations, SHORT_STOPS)

@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import gc
 import math
 import threading
 import warnings
@@ -91,23 +92,44 @@ class SharedManager:
         return self.manager
 
 
-def sharing_pipeline(frozen: Dict[int, FrozenView]) -> Type[HierStylePipeline]:
-    """A stage-2 pipeline whose views are frozen once for all runs on the same coarse field and photos.
+@dataclass
+class Shared:
+    """What runs of stage 2 on the same coarse field, photos and painting have in common.
 
-    Args:
-        frozen: where they are kept, by the address of the view's rays.
+    Attributes:
+        frozen: the photos' views, by the address of their rays.
+        targets: the painting's features, by the settings that they depend on.
     """
 
-    class SharingPipeline(HierStylePipeline):
-        """See `sharing_pipeline`."""
+    frozen: Dict[int, FrozenView] = field(default_factory=dict)
+    targets: Dict[Tuple[Any, ...], StyleTargets] = field(default_factory=dict)
 
-        def _freeze(self, origins: Tensor, directions: Tensor, keep_bytes: float) -> FrozenView:
-            key = origins.data_ptr()
-            if key not in frozen:
-                frozen[key] = super()._freeze(origins, directions, keep_bytes)
-            return frozen[key]
+    def pipeline(self) -> Type[HierStylePipeline]:
+        """A stage-2 pipeline that works out only what no run before it has."""
+        shared = self
 
-    return SharingPipeline
+        class SharingPipeline(HierStylePipeline):
+            """See `Shared.pipeline`."""
+
+            def prepare_style(self) -> None:
+                """Takes the painting's features from a run before, or makes them."""
+                config = self.config
+                key = (config.feature_side, config.style_side, config.style_features)
+                if key not in shared.targets:
+                    super().prepare_style()
+                    shared.targets[key] = self.targets
+                self.targets = shared.targets[key]
+
+            def _freeze(self, origins: Tensor, directions: Tensor, keep_bytes: float) -> FrozenView:
+                photos = self.datamanager.pixels.origins
+                if origins.untyped_storage().data_ptr() != photos.untyped_storage().data_ptr():
+                    return super()._freeze(origins, directions, keep_bytes)  # a novel view's rays don't last
+                key = origins.data_ptr()
+                if key not in shared.frozen:
+                    shared.frozen[key] = super()._freeze(origins, directions, keep_bytes)
+                return shared.frozen[key]
+
+        return SharingPipeline
 
 
 @contextlib.contextmanager
@@ -232,7 +254,7 @@ class Study:
         self.own_error: Optional[float] = None
         self.style_model: Optional[HierStyleModel] = None
         self.is_stylised = False
-        self.frozen: Dict[int, FrozenView] = {}
+        self.shared = Shared()
         self.coarse_view_seconds = self.style_view_seconds = 0.0
         if options.coarse_run is not None:
             self._adopt_coarse_run(options.coarse_run)
@@ -293,6 +315,11 @@ class Study:
 
     # ----------------------------------------------------------------------------------------------------- training
 
+    def collect_garbage(self) -> None:
+        """Gives memory of runs before back; what was there before them needn't be searched, which takes most time."""
+        gc.collect()
+        gc.freeze()
+
     def _shared(self, config: TrainerConfig) -> SharedManager:
         manager = copy.copy(self.manager)
         manager.config = copy.copy(self.manager.config)
@@ -315,7 +342,7 @@ class Study:
         config.pipeline.datamanager = self._shared(config)
         state = None
         if isinstance(config.pipeline, HierStylePipelineConfig):
-            state, config.pipeline._target = self.coarse_state, sharing_pipeline(self.frozen)
+            state, config.pipeline._target = self.coarse_state, self.shared.pipeline()
         return Training(config, self.device, state)
 
     def adapted_style_config(self) -> TrainerConfig:
