@@ -92,6 +92,11 @@ class SharedManager:
         return self.manager
 
 
+def settings_of_targets(config: HierStylePipelineConfig) -> Tuple[Any, ...]:
+    """What the painting's features depend on, beside the painting and the network."""
+    return config.feature_side, config.style_side, config.style_features
+
+
 @dataclass
 class Shared:
     """What runs of stage 2 on the same coarse field, photos and painting have in common.
@@ -113,8 +118,7 @@ class Shared:
 
             def prepare_style(self) -> None:
                 """Takes the painting's features from a run before, or makes them."""
-                config = self.config
-                key = (config.feature_side, config.style_side, config.style_features)
+                key = settings_of_targets(self.config)
                 if key not in shared.targets:
                     super().prepare_style()
                     shared.targets[key] = self.targets
@@ -246,15 +250,16 @@ class Study:
         count = min(HELD_OUT_VIEWS, len(self.eval_dataset))
         self.views = list(evenly_spaced(len(self.eval_dataset), count))
         self.photos = {view: self.eval_dataset[view]["image"][..., :3].to(self.device) for view in self.views}
+        self.shared = Shared()
         self.targets: Optional[StyleTargets] = None
         if options.style_image is not None:
             self.targets = pipeline.load_targets(self.device)
+            self.shared.targets[settings_of_targets(pipeline)] = self.targets
         self.coarse_state: Optional[Dict[str, Tensor]] = None
         self.coarse_model: Optional[CoarseFewShotModel] = None
         self.own_error: Optional[float] = None
         self.style_model: Optional[HierStyleModel] = None
         self.is_stylised = False
-        self.shared = Shared()
         self.coarse_view_seconds = self.style_view_seconds = 0.0
         if options.coarse_run is not None:
             self._adopt_coarse_run(options.coarse_run)

@@ -35,7 +35,7 @@ def recommendation(axes: Sequence[Axis]) -> List[str]:
         elif axis.name == "stage-2 iterations":
             lines += stage2_lines(axis)
         elif axis.points:
-            lines.append(setting_line(axis))
+            lines.append(setting_line(axis) + order_in_words(axis))
     return lines
 
 
@@ -102,6 +102,11 @@ def setting_line(axis: Axis) -> str:
     return f"{head}{chosen.setting} instead of {preset.setting}: {_compared(axis, chosen, preset)}" + _mark(
         chosen, preset
     )
+
+
+def order_in_words(axis: Axis) -> str:
+    """How fast the error falls with the samples, where that was observed."""
+    return "" if axis.order is None else f" Observed order of convergence: {axis.order:.1f}."
 
 
 def _instead(axis: Axis, preset: Point) -> str:

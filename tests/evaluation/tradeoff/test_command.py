@@ -153,6 +153,18 @@ def test_without_a_painting_what_stylises_is_left_out(llff_scene, tmp_path):
     assert "there is no painting" in report.measured[1].note
 
 
+def test_a_blender_scene_is_measured_too(tmp_path):
+    import make_sample_scene
+
+    sizes = ["--num-train", "9", "--num-val", "1", "--num-test", "1", "--width", "16"]
+    make_sample_scene.main([str(tmp_path), "--layout", "blender", *sizes])
+    scene = tmp_path / "blender"
+    options = make_options(scene, tmp_path, groups=("quadrature",))
+    options.dataparser = command.parse_dataparser((), scene)
+    report, _ = measure(options, seconds=1000.0)
+    assert [axis.name for axis in report.measured] == ["stage-1 iterations", *AXES["quadrature"]]
+
+
 def test_the_budget_is_kept_and_what_does_not_fit_is_named(llff_scene, painting, tmp_path):
     options = make_options(llff_scene, tmp_path, style_image=painting)
     report, clock = measure(options, seconds=2.0)

@@ -122,6 +122,12 @@ def test_a_better_setting_is_named_with_what_it_changes():
     assert "32 instead of 64: 2× as fast, costs 0.097 dB against photos instead of 0.0069" in line
 
 
+def test_the_observed_order_is_said():
+    axis = quadrature_axis()
+    axis.order = 1.46
+    assert recommendation([axis])[0].endswith("Observed order of convergence: 1.5.")
+
+
 def test_of_runs_the_ends_are_compared():
     assert "128 instead of 256: 19.00 dB instead of 18.00" in setting_line(width_axis())
     assert "keep 256" in setting_line(width_axis(narrow=17.0))
