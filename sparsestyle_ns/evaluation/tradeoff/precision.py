@@ -80,7 +80,7 @@ class PrecisionGroup:
             return in_chunks(bundle, samples, budget, lambda part: model.render(part, samples, None)[0].rgb)
 
         def case(precision: Precision) -> Callable[[], Values]:
-            training = study.start(with_setting(study.coarse_config, "pipeline.model.precision", precision))
+            training = study.start(with_setting(study.coarse_config, "pipeline.model.precision", precision), budget)
             training.step()
 
             def measure() -> Values:

@@ -26,13 +26,13 @@ MIN_RAYS, MAX_RAYS = 64, 4096
 PROBE_RAYS = 64
 MIN_ALPHAS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3)
 MIN_TRANSMITTANCES = (0.0, 1e-4, 1e-3, 1e-2, 1e-1)
-FACTORS = (0.25, 0.5, 1, 2, 4)
+FACTORS = (1 / 8, 1 / 4, 1 / 2, 1, 2)
 """Numbers of samples, as multiples of the preset's."""
 
 
 def multiples(preset: int) -> Tuple[int, ...]:
-    """The numbers of samples to measure."""
-    return tuple(max(2, round(preset * factor)) for factor in FACTORS)
+    """The numbers of samples to measure, ascending."""
+    return tuple(sorted({max(2, round(preset * factor)) for factor in FACTORS}))
 
 
 def difference(picture: Float[Tensor, "rays 3"], reference: Float[Tensor, "rays 3"]) -> Dict[str, float]:

@@ -43,6 +43,7 @@ class Stage1:
         self._presets: Dict[int, Moments] = {}
         self._seconds: Optional[float] = None
         self._views: List[int] = []
+        self._stops: Sequence[float] = SHORT_STOPS
 
     def long_plan(self) -> Plan:
         """The long run."""
@@ -65,26 +66,27 @@ class Stage1:
 
     def _step_seconds(self, config: TrainerConfig, budget: Budget) -> float:
         """Seconds of an iteration, from a few; makes sure that the time of a held-out view is known."""
-        probe = self.study.start(config)
+        probe = self.study.start(config, budget)
         seconds = self.study.step_seconds(probe, budget)
         if not self.study.coarse_view_seconds:
-            self.study.evaluate_coarse(probe.pipeline.model, self.study.views[:1])
+            self.study.estimate_coarse_view(probe.pipeline.model)
         return seconds
 
     def _long(self, axis: Axis, budget: Budget) -> None:
         study, config = self.study, self.study.coarse_config
         step = self._step_seconds(config, budget)
-        views = study.views_that_fit(budget, len(LONG_STOPS), study.coarse_view_seconds)
-        iterations = self._fitting(config, step, budget, len(LONG_STOPS), len(views))
+        stops = study.stops_that_fit(budget, LONG_STOPS, study.coarse_view_seconds)
+        views = study.views_that_fit(budget, len(stops), study.coarse_view_seconds)
+        iterations = self._fitting(config, step, budget, len(stops), len(views))
         axis.note = (
             f"One run of {config.method_name}, its schedules fitted to {iterations} iterations (the preset has "
             f"{config.max_num_iterations}); mean over {len(views)} held-out views. The clock stands still while they "
             "are evaluated."
         )
-        training = study.start(squeezed(config, iterations))
+        training = study.start(squeezed(config, iterations), budget)
         model = training.pipeline.model
         reserve = len(views) * study.coarse_view_seconds
-        for checkpoint in study.train(training, stops_of(iterations, LONG_STOPS), budget, reserve):
+        for checkpoint in study.train(training, stops_of(iterations, stops), budget, reserve):
             if study.options.coarse_run is None:
                 study.keep_coarse(model)
             values = {"train_seconds": checkpoint.seconds, **study.evaluate_coarse(model, views)}
@@ -99,12 +101,13 @@ class Stage1:
         study = self.study
         step = self._step_seconds(config, budget)
         if not self._views:
-            self._views = study.views_that_fit(budget, len(SHORT_STOPS), study.coarse_view_seconds)
-        iterations = self._fitting(config, step, budget, len(SHORT_STOPS), len(self._views))
-        training = study.start(squeezed(config, iterations), seed)
+            self._stops = study.stops_that_fit(budget, SHORT_STOPS, study.coarse_view_seconds)
+            self._views = study.views_that_fit(budget, len(self._stops), study.coarse_view_seconds)
+        iterations = self._fitting(config, step, budget, len(self._stops), len(self._views))
+        training = study.start(squeezed(config, iterations), budget, seed)
         moments: Moments = []
         reserve = len(self._views) * study.coarse_view_seconds
-        stops = stops_of(iterations, SHORT_STOPS)
+        stops = stops_of(iterations, self._stops)
         try:
             for number, checkpoint in enumerate(study.train(training, stops, budget, reserve)):
                 values: Values = {"train_seconds": checkpoint.seconds, "iterations": checkpoint.iterations}

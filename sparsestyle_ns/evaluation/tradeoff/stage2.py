@@ -55,6 +55,7 @@ class Stage2:
         self._presets: Dict[int, Run] = {}
         self._iterations: Optional[int] = None
         self._views: List[int] = []
+        self._stops: Sequence[float] = SHORT_STOPS
         self._costs = Costs()
 
     def long_plan(self) -> Plan:
@@ -98,34 +99,38 @@ class Stage2:
             raise OutOfTimeError
         return self.study.adapted_style_config()
 
-    def _plan_run(self, config: TrainerConfig, budget: Budget, stops: int) -> Tuple[int, List[int]]:
-        """How many iterations fit into the budget of a run, and the held-out views to look at."""
+    def _plan_run(
+        self, config: TrainerConfig, budget: Budget, shares: Sequence[float]
+    ) -> Tuple[int, Sequence[float], List[int]]:
+        """How many iterations fit into the budget of a run, where to stop, and the held-out views to look at."""
         study = self.study
         cold = with_setting(config, "pipeline.warm_start_steps", 0)
         if not study.shared.frozen:
-            study.start(cold)  # freezes the views, once for all runs
+            study.start(cold, budget)  # freezes the views, once for all runs
             budget.check()
-        setup, probe = study.timed(lambda: study.start(cold))
+        setup, probe = study.timed(lambda: study.start(cold, budget))
         step = study.step_seconds(probe, budget)
         if not study.style_view_seconds:
-            study.evaluate_style(probe.pipeline.model, study.views[:1])
-        views = study.views_that_fit(budget, stops, study.style_view_seconds)
-        left = budget.left - setup - stops * len(views) * study.style_view_seconds
-        return min(config.max_num_iterations, max(MIN_ITERATIONS, int(WARM_START_SHARE * left / step))), views
+            study.estimate_style_view(probe.pipeline.model)
+        stops = study.stops_that_fit(budget, shares, study.style_view_seconds)
+        views = study.views_that_fit(budget, len(stops), study.style_view_seconds)
+        left = budget.left - setup - len(stops) * len(views) * study.style_view_seconds
+        fitting = max(MIN_ITERATIONS, int(WARM_START_SHARE * left / step))
+        return min(config.max_num_iterations, fitting), stops, views
 
     def _long(self, axis: Axis, budget: Budget) -> None:
         study, config = self.study, self._config(budget)
-        iterations, views = self._plan_run(config, budget, len(LONG_STOPS))
+        iterations, stops, views = self._plan_run(config, budget, LONG_STOPS)
         axis.note = (
             f"One run of {config.method_name}, its schedules fitted to {iterations} iterations (the preset has "
             f"{config.max_num_iterations}); mean over {len(views)} held-out views. The clock stands still while they "
             "are evaluated, and doesn't run during preparation and warm start."
         )
-        training = study.start(squeezed(config, iterations))
+        training = study.start(squeezed(config, iterations), budget)
         model = training.pipeline.model
         study.keep_style(model)
         reserve = len(views) * study.style_view_seconds
-        for checkpoint in study.train(training, stops_of(iterations, LONG_STOPS), budget, reserve):
+        for checkpoint in study.train(training, stops_of(iterations, stops), budget, reserve):
             values = {"train_seconds": checkpoint.seconds, **study.evaluate_style(model, views)}
             axis.add(checkpoint.iterations, values, checkpoint.busy)
 
@@ -133,9 +138,9 @@ class Stage2:
         study, run = self.study, Run()
         assert self._iterations is not None
         study.collect_garbage()  # what is left of the run before would count as this one's memory
-        training = study.start(squeezed(config, self._iterations), seed)
+        training = study.start(squeezed(config, self._iterations), budget, seed)
         reserve = len(self._views) * study.style_view_seconds
-        stops = stops_of(self._iterations, SHORT_STOPS)
+        stops = stops_of(self._iterations, self._stops)
         checkpoints = study.train(training, stops, budget, reserve, run.steps)
         for number in range(len(stops)):
             with PeakMemory(study.device) as memory:
@@ -155,7 +160,7 @@ class Stage2:
         try:
             if self._iterations is None:
                 part = budget.part(budget.left / (len(values) + 0.5))
-                self._iterations, self._views = self._plan_run(config, part, len(SHORT_STOPS))
+                self._iterations, self._stops, self._views = self._plan_run(config, part, SHORT_STOPS)
             for round_ in range(study.options.rounds):
                 for value in values:
                     run = self._presets.get(round_) if value == preset else None

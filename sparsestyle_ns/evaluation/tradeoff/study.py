@@ -42,6 +42,8 @@ EVALUATION_SHARE = 0.3
 """Part of a run's time that evaluating it may take; how many views are looked at follows from it."""
 LOADING_SHARE = 0.05
 """Part of all time that evaluating a coarse run may take before anything is measured; else one view stands for all."""
+PROBE_RAYS = 256
+"""Rays from which the time of a view is estimated."""
 PROBE_STEPS = 3
 """Iterations from which the time of one is estimated, after one that doesn't count."""
 
@@ -104,10 +106,12 @@ class Shared:
     Attributes:
         frozen: the photos' views, by the address of their rays.
         targets: the painting's features, by the settings that they depend on.
+        check: called before a view is frozen; raises `OutOfTimeError` where there is no time for it.
     """
 
     frozen: Dict[int, FrozenView] = field(default_factory=dict)
     targets: Dict[Tuple[Any, ...], StyleTargets] = field(default_factory=dict)
+    check: Callable[[], None] = lambda: None
 
     def pipeline(self) -> Type[HierStylePipeline]:
         """A stage-2 pipeline that works out only what no run before it has."""
@@ -130,6 +134,7 @@ class Shared:
                     return super()._freeze(origins, directions, keep_bytes)  # a novel view's rays don't last
                 key = origins.data_ptr()
                 if key not in shared.frozen:
+                    shared.check()
                     shared.frozen[key] = super()._freeze(origins, directions, keep_bytes)
                 return shared.frozen[key]
 
@@ -337,9 +342,14 @@ class Study:
         config.pipeline.datamanager = self._shared(config)
         return config.pipeline.setup(device=str(self.device), test_mode="test", world_size=1, local_rank=0)
 
-    def start(self, config: TrainerConfig, seed: int = 0) -> Training:
-        """Training with a method's config, its schedules as they are there, on the shared photos."""
+    def start(self, config: TrainerConfig, budget: Budget, seed: int = 0) -> Training:
+        """Training with a method's config, its schedules as they are there, on the shared photos.
+
+        Raises:
+            OutOfTimeError: the time was over before all views of stage 2 were frozen; those that were stay so.
+        """
         torch.manual_seed(seed)
+        self.shared.check = budget.check
         config = copy.deepcopy(config)
         if hasattr(config.pipeline.model, "seed"):
             config.pipeline.model.seed += seed
@@ -409,6 +419,32 @@ class Study:
                 raise OutOfTimeError
 
     # --------------------------------------------------------------------------------------------------- evaluation
+
+    @torch.no_grad()
+    def estimate_coarse_view(self, model: CoarseFewShotModel) -> None:
+        """Estimates what a held-out view takes, from some of its rays."""
+        model.eval()
+        self.coarse_view_seconds = self._seconds_of_pixels(model.get_outputs)
+
+    @torch.no_grad()
+    def estimate_style_view(self, model: HierStyleModel) -> None:
+        """The same for a stylised view and its losses."""
+        assert self.targets is not None
+        model.eval()
+        photo = self.photos[self.views[0]]
+        seconds, features = self.timed(lambda: self.targets.features(photo))
+        losses, _ = self.timed(lambda: self.targets.losses(photo, features))
+        self.style_view_seconds = self._seconds_of_pixels(model.get_outputs) + seconds + losses
+
+    def _seconds_of_pixels(self, render: Callable[[RayBundle], Any]) -> float:
+        rays = self.some_rays(PROBE_RAYS)
+        render(rays)
+        return self.timed(lambda: render(rays))[0] * self.pixels / len(rays)
+
+    def stops_that_fit(self, budget: Budget, stops: Sequence[float], view_seconds: float) -> Sequence[float]:
+        """The last of a run's stops, as many as there is time for to look at a view; at least one."""
+        count = int(EVALUATION_SHARE * budget.left / max(view_seconds, 1e-9))
+        return stops[-max(1, count) :]
 
     def views_that_fit(self, budget: Budget, stops: int, view_seconds: float) -> List[int]:
         """The held-out views to look at so many times in a run: as many as there is time for, at least one."""
