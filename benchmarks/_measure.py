@@ -1,14 +1,10 @@
 """Timing contenders in turn, the record of where and when, and the files that benchmarks write."""
 
 import gc
-import importlib.metadata
 import json
 import os
-import platform
-import resource
 import statistics
 import subprocess
-import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
@@ -17,20 +13,17 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Literal, Optional, Sequence, Tuple
 
-import psutil
 import torch
 from torch import Tensor
 
 from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.whole_files import write_text_whole
+from sparsestyle_ns.evaluation.machine import OtherLoad, device_name, synchronize, versions
+from sparsestyle_ns.files import write_whole
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 CACHE = ROOT / ".bench"
 """What can be made again, and results that nobody should quote; not in git."""
-PACKAGES = ("torch", "numpy", "nerfstudio", "numba")
-BUSY_SHARE = 0.1
-"""Share of all cores that other processes may use before a figure is marked."""
 
 # ------------------------------------------------------------------------------------------------------- command line
 
@@ -110,12 +103,6 @@ Measure = Callable[[int], Duration]
 """Does a contender's work once; takes the number of the repetition, −1 for the warm-up."""
 
 
-def synchronize(device: torch.device) -> None:
-    """Waits until a GPU has done what it was told."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-
-
 def timed(
     work: Callable[..., Any],
     device: torch.device,
@@ -191,68 +178,7 @@ def in_fresh_process(function: Callable[..., Any], *arguments: Any) -> Any:
         return pool.submit(function, *arguments).result()
 
 
-def peak_bytes(device: torch.device) -> int:
-    """The most memory this process has had: of a GPU what torch had allocated, else all that was resident."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    status = Path("/proc/self/status")
-    if status.is_file():
-        # Unlike getrusage's figure, this one isn't inherited from the process that started this one.
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-
-
 # -------------------------------------------------------------------------------------------------------- environment
-
-
-class OtherLoad:
-    """How much of all cores other processes use: for a second before the benchmark, and on average while it runs."""
-
-    def __init__(self) -> None:
-        self.before = psutil.cpu_percent(interval=1.0) / 100
-        self._start = self._now()
-
-    def _now(self) -> Tuple[float, float]:
-        """Seconds that all cores together have had, and those of them in which another process ran."""
-        times = psutil.cpu_times()
-        cores = (os.cpu_count() or 1) * time.monotonic()
-        own = sum(os.times()[:4])  # with those of processes that it started, once they have ended
-        return cores, cores - times.idle - getattr(times, "iowait", 0.0) - own
-
-    def record(self) -> Dict[str, Any]:
-        """Both shares, in [0, 1], and whether the machine counts as busy."""
-        cores, others = (now - then for now, then in zip(self._now(), self._start, strict=True))
-        during = min(1.0, max(0.0, others / max(cores, 1e-9)))
-        return {
-            "before": round(self.before, 3),
-            "during": round(during, 3),
-            "busy": max(self.before, during) > BUSY_SHARE,
-        }
-
-
-def device_name(device: torch.device) -> str:
-    """The GPU's name, or the CPU's model."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    information = Path("/proc/cpuinfo")
-    if information.is_file():
-        for line in information.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
-
-
-def versions() -> Dict[str, str]:
-    """Versions of Python and of the packages that matter, as far as they are installed."""
-    found = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return found
 
 
 def git(*arguments: str) -> Optional[str]:
@@ -346,11 +272,9 @@ def write_json(path: Path, content: Any) -> Path:
         InputError: the folder can't be written to.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_text_whole(path, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
+        return write_whole(path, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
     except OSError as error:
         raise InputError(f"{path} can't be written ({error.strerror}); name another --output-dir.") from error
-    return path
 
 
 def check_equal(ours: Tensor, peer: Tensor, what: str, tolerance: float) -> None:

@@ -1,27 +1,23 @@
-"""What benchmarks run on: a scene, a coarse run of it, our training loop, and the plain way to do the same."""
+"""What benchmarks run on: a scene, a coarse run of it, and the plain way to do the same."""
 
 import copy
-import functools
 import math
 import os
 import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, Optional, Tuple
 
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.field_components.encodings import HashEncoding
 from nerfstudio.field_components.mlp import MLP
 from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor, nn
-from torch.amp import GradScaler
 from torch.utils.checkpoint import checkpoint
 
 from benchmarks._measure import CACHE, ROOT, Options
@@ -29,10 +25,10 @@ from sparsestyle_ns.coarse_run import CoarseRun, find_coarse_run
 from sparsestyle_ns.datamanager import FewShotDataManager
 from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
 from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.evaluation.training import Training
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField, fine_density
-from sparsestyle_ns.finite_steps import FiniteOptimizers
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
@@ -43,7 +39,6 @@ from sparsestyle_ns.rendering.space import Space
 from sparsestyle_ns.rendering.volume import over_background
 from sparsestyle_ns.scene_record import record_scene
 from sparsestyle_ns.schedules import content_weight
-from sparsestyle_ns.trainer import SparseStyleTrainerConfig
 
 BACKBONE = "vgg16-shift-tolerant"
 """The feature network of all benchmarks: its weights are on every machine, so that figures can be compared."""
@@ -164,50 +159,6 @@ def style_config(scene: Scene, coarse: CoarseRun, longer_side: int, options: Opt
         pipeline.feature_side, pipeline.warm_start_steps = 64, 1
         pipeline.model.log2_table_size, pipeline.model.occupancy_resolution = 12, 16
     return config
-
-
-# ---------------------------------------------------------------------------------------------------------------- ours
-
-
-class Training:
-    """A method's pipeline and optimisers. `step` is an iteration of nerfstudio's trainer without its logging.
-
-    Args:
-        config: of any nerfstudio method.
-        device: where to train.
-        coarse: the coarse run that a stylised one builds on.
-    """
-
-    def __init__(self, config: TrainerConfig, device: torch.device, coarse: Optional[CoarseRun] = None) -> None:
-        self.pipeline: Any = config.pipeline.setup(device=str(device), test_mode="val", world_size=1, local_rank=0)
-        if coarse is not None:
-            self.pipeline.model.adopt_coarse(coarse.model_state())
-        kind = FiniteOptimizers if isinstance(config, SparseStyleTrainerConfig) else Optimizers
-        self.optimizers = kind(copy.deepcopy(config.optimizers), self.pipeline.get_param_groups())
-        self.grad_scaler = GradScaler(device.type, enabled=False)
-        attributes = TrainingCallbackAttributes(
-            optimizers=self.optimizers,
-            grad_scaler=None,
-            pipeline=self.pipeline,
-            trainer=SimpleNamespace(config=config, _start_step=0),
-        )
-        self.callbacks = self.pipeline.get_training_callbacks(attributes)
-        self.num_steps = 0
-
-    def step(self) -> Tensor:
-        """One iteration; returns its loss."""
-        self.pipeline.train()
-        for callback in self.callbacks:
-            callback.run_callback_at_location(self.num_steps, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-        self.optimizers.zero_grad_all()
-        _, losses, _ = self.pipeline.get_train_loss_dict(self.num_steps)
-        loss = functools.reduce(torch.add, losses.values())
-        loss.backward()
-        self.optimizers.optimizer_scaler_step_some(self.grad_scaler, list(self.optimizers.parameters))
-        for scheduler in self.optimizers.schedulers.values():
-            scheduler.step()
-        self.num_steps += 1
-        return loss.detach()
 
 
 # ------------------------------------------------------------------------------------------------------- the plain way

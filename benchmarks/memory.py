@@ -6,10 +6,12 @@ from typing import Any, Dict, List
 
 import tyro
 
-from benchmarks._measure import Options, Ratio, Report, in_fresh_process, peak_bytes
-from benchmarks._scene import Scene, Training, find_or_train_coarse, find_scene, style_config
+from benchmarks._measure import Options, Ratio, Report, in_fresh_process
+from benchmarks._scene import Scene, find_or_train_coarse, find_scene, style_config
 from sparsestyle_ns.coarse_run import read_coarse_run
 from sparsestyle_ns.errors import exit_on_input_error
+from sparsestyle_ns.evaluation.machine import peak_bytes
+from sparsestyle_ns.evaluation.training import Training
 
 SIDES = (1008, 252)
 LIMIT = 8_000_000_000
@@ -32,7 +34,7 @@ def peak_of_steps(options: MemoryOptions, scene: Scene, coarse_run: Path, side: 
     config = style_config(scene, coarse, side, options)
     config.pipeline.cache_gigabytes = options.cache_gigabytes
     config.pipeline.warm_start_steps = 1
-    training = Training(config, device, coarse)
+    training = Training(config, device, coarse.model_state())
     for _ in range(options.steps):
         training.step()
     frozen = [view.frozen for view in training.pipeline.views]

@@ -11,9 +11,10 @@ import tyro
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks._measure import Options, Report, check_equal, in_fresh_process, peak_bytes, ratio_of_pairs, timed
+from benchmarks._measure import Options, Report, check_equal, in_fresh_process, ratio_of_pairs, timed
 from benchmarks._scene import BACKBONE, find_scene, load_photos
 from sparsestyle_ns.errors import exit_on_input_error
+from sparsestyle_ns.evaluation.machine import peak_bytes
 from sparsestyle_ns.losses.content import content_loss
 from sparsestyle_ns.losses.nnfm import StyleIndex, nnfm_loss
 from sparsestyle_ns.style.image import load_style_image

@@ -16,7 +16,6 @@ from torch import Tensor
 from benchmarks._measure import Measure, Options, Report, ratio_of_pairs, timed
 from benchmarks._scene import (
     PLAIN_NOTE,
-    Training,
     find_or_train_coarse,
     find_scene,
     plain_field_of,
@@ -25,6 +24,7 @@ from benchmarks._scene import (
 from sparsestyle_ns.errors import exit_on_input_error
 from sparsestyle_ns.evaluation.held_out import rendered
 from sparsestyle_ns.evaluation.image_metrics import psnr
+from sparsestyle_ns.evaluation.training import Training
 
 SIDE = 252
 FRAMES_BETWEEN_VIEWS = 10
@@ -48,7 +48,7 @@ def main(options: RenderOptions) -> None:
     coarse = find_or_train_coarse(scene, options)
     config = style_config(scene, coarse, SIDE, options)
     config.pipeline.warm_start_steps = min(config.pipeline.warm_start_steps, options.style_iterations)
-    training = Training(config, report.device, coarse)
+    training = Training(config, report.device, coarse.model_state())
     iterations = 1 if options.quick else options.style_iterations
     for _ in range(iterations):
         training.step()

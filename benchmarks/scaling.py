@@ -8,9 +8,10 @@ from typing import Any, Callable, Dict, List, Tuple
 import tyro
 
 from benchmarks._measure import Options, Report, alternate, timed
-from benchmarks._scene import Training, find_or_train_coarse, find_scene, style_config
+from benchmarks._scene import find_or_train_coarse, find_scene, style_config
 from sparsestyle_ns.coarse_run import CoarseRun
 from sparsestyle_ns.errors import exit_on_input_error
+from sparsestyle_ns.evaluation.training import Training
 
 SIDE = 126
 COSTS = {
@@ -56,7 +57,7 @@ AXES: Dict[str, Tuple[Callable[[Any, int], None], Tuple[int, ...]]] = {
 
 def measure_costs(config: Any, coarse: CoarseRun, report: Report) -> Dict[str, Any]:
     """Pixels of a view, what the views take in memory, and seconds of each repetition for each of `COSTS`."""
-    training = Training(config, report.device, coarse)
+    training = Training(config, report.device, coarse.model_state())
     pipeline = training.pipeline
     camera = pipeline.datamanager.eval_dataset.cameras[:1].to(report.device)
     work = {

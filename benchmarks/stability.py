@@ -12,9 +12,10 @@ import torch
 import tyro
 
 from benchmarks._measure import Options, Report
-from benchmarks._scene import BACKBONE, Training, at_size, find_or_train_coarse, find_scene
+from benchmarks._scene import BACKBONE, at_size, find_or_train_coarse, find_scene
 from sparsestyle_ns.coarse_run import CoarseRun
 from sparsestyle_ns.errors import InputError, exit_on_input_error
+from sparsestyle_ns.evaluation.training import Training
 from sparsestyle_ns.method_configs import method_config
 
 WORSE = 1.5
@@ -77,7 +78,7 @@ def attempt(config: Any, coarse: Optional[CoarseRun], rate: float, iterations: i
     config.optimizers["fields"] = {**config.optimizers["fields"], "scheduler": None}
     config.optimizers["fields"]["optimizer"].lr = rate
     torch.manual_seed(0)
-    training = Training(config, device, coarse)
+    training = Training(config, device, None if coarse is None else coarse.model_state())
     losses = [training.step().item() for _ in range(iterations)]
     last = losses[-max(1, round(LAST * iterations)) :]
     return Trial(rate, sum(last) / len(last), training.optimizers.skipped().total)

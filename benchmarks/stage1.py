@@ -17,10 +17,11 @@ from nerfstudio.configs.method_configs import method_configs
 from nerfstudio.engine.trainer import TrainerConfig
 
 from benchmarks._measure import Duration, Measure, Options, Report, ratio_of_pairs, timed
-from benchmarks._scene import COARSE_METHOD, Scene, Training, at_size, find_scene, load_photos
+from benchmarks._scene import COARSE_METHOD, Scene, at_size, find_scene, load_photos
 from sparsestyle_ns.effects.registry import EffectSettings
 from sparsestyle_ns.errors import InputError, exit_on_input_error
 from sparsestyle_ns.evaluation.image_metrics import psnr
+from sparsestyle_ns.evaluation.training import Training
 from sparsestyle_ns.method_configs import method_config
 
 SIDE = 126

@@ -6,12 +6,12 @@ from benchmarks._measure import Options, Report, ratio_of_pairs, timed
 from benchmarks._scene import (
     PLAIN_NOTE,
     PlainTraining,
-    Training,
     find_or_train_coarse,
     find_scene,
     style_config,
 )
 from sparsestyle_ns.errors import exit_on_input_error
+from sparsestyle_ns.evaluation.training import Training
 
 SIDE = 252
 TARGET = 10.0
@@ -25,7 +25,7 @@ def main(options: Options) -> None:
     coarse = find_or_train_coarse(scene, options)
     config = style_config(scene, coarse, SIDE, options)
     config.pipeline.warm_start_steps = 0
-    ours = Training(config, report.device, coarse)
+    ours = Training(config, report.device, coarse.model_state())
     plain = PlainTraining(ours)
     height, width = ours.pipeline.datamanager.pixels.sizes[0]
 

@@ -6,7 +6,7 @@ when it runs, so that help is there at once.
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Callable, Dict, Optional, Sequence, Tuple
+from typing import Annotated, Any, Callable, Dict, Literal, Optional, Sequence, Tuple
 
 import tyro
 
@@ -106,10 +106,77 @@ def effects(
     print(decisions.json() if json else decisions.text())
 
 
+@exit_on_input_error
+def tradeoff(
+    data: Path,
+    dataparser: Annotated[Tuple[str, ...], tyro.conf.Positional] = (),
+    style_image: Optional[Path] = None,
+    budget: str = "10m",
+    output_dir: Path = Path("tradeoff"),
+    coarse_run: Optional[Path] = None,
+    max_image_side: Optional[int] = None,
+    num_views: Optional[int] = None,
+    view_ids: Optional[Tuple[int, ...]] = None,
+    full: bool = False,
+    groups: Tuple[Literal["quadrature", "training", "fine-field", "style", "rendering", "precision"], ...] = (),
+    rounds: int = 3,
+    vgg_weights: Optional[Path] = None,
+    backbone: Literal["auto", "vgg16", "vgg16-shift-tolerant"] = "auto",
+) -> None:
+    """Measures what accuracy costs in time, on this machine and a scene of yours.
+
+    Writes curves of error against time for each setting that trades one for the other, as a page that opens offline,
+    JSON and CSV, and says in plain words what to turn. Ctrl-C keeps what has been measured.
+
+    Args:
+        data: The scene, as for ns-train.
+        dataparser: How to read it, where its files don't tell: llff-data, blender-data, colmap …; its options come
+            after two dashes: -- llff-data --eval-interval 4.
+        style_image: The painting; without it, what stylises is left out.
+        budget: Time that it may take, such as 90s, 10m or 1h30m. More of it gives longer runs and more repetitions.
+        output_dir: Folder of the report.
+        coarse_run: Folder of a coarse-fewshot run of this scene to render; left out, one is trained in a part of the
+            time.
+        max_image_side: Longer side of the photos in pixels; left out, the preset's.
+        num_views: How many photos to train on, by the standard split.
+        view_ids: The photos to train on, by number, instead.
+        full: Start from the full methods' settings instead of the drafts'.
+        groups: What to measure; left out, everything.
+        rounds: Repetitions of each measurement at most.
+        vgg_weights: File with the weights of VGG-16, as for ns-train.
+        backbone: Feature network, as for ns-train.
+    """
+    from sparsestyle_ns.evaluation.tradeoff import command
+    from sparsestyle_ns.evaluation.tradeoff.budget import parse_duration
+
+    seconds = parse_duration(budget)
+    if rounds < 1:
+        raise InputError(f"--rounds is {rounds}, but has to be at least 1.")
+    command.run(
+        command.Options(
+            dataparser=command.parse_dataparser(dataparser, data),
+            data=data,
+            output_dir=output_dir,
+            style_image=style_image,
+            coarse_run=coarse_run,
+            full=full,
+            max_image_side=max_image_side,
+            num_views=num_views,
+            view_ids=view_ids,
+            vgg_weights=vgg_weights,
+            backbone=backbone,
+            rounds=rounds,
+            groups=groups,
+        ),
+        seconds,
+    )
+
+
 SUBCOMMANDS: Dict[str, Callable[..., Any]] = {
     "effects": effects,
     "evaluate": evaluate,
     "gallery": gallery,
+    "tradeoff": tradeoff,
 }
 
 

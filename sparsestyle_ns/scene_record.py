@@ -9,7 +9,7 @@ import numpy as np
 
 from sparsestyle_ns.datamanager import FewShotDataManager
 from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.whole_files import write_text_whole
+from sparsestyle_ns.files import write_whole
 
 FILE_NAME = "scene.json"
 
@@ -38,7 +38,7 @@ class SceneRecord:
 
     def save(self, folder: Path) -> None:
         """Writes `scene.json` into a run's folder."""
-        write_text_whole(folder / FILE_NAME, json.dumps(asdict(self), indent=1) + "\n")
+        write_whole(folder / FILE_NAME, json.dumps(asdict(self), indent=1) + "\n")
 
     @classmethod
     def load(cls, folder: Path) -> "SceneRecord":

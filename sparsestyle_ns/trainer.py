@@ -29,11 +29,11 @@ from sparsestyle_ns.datamanager import FewShotDataManager
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.errors import InputError, exit_on_input_error
+from sparsestyle_ns.files import write_whole
 from sparsestyle_ns.finite_steps import FiniteOptimizers
 from sparsestyle_ns.processes import any_process, from_first_process, prepare_launch, share_state
 from sparsestyle_ns.scene_record import record_scene
 from sparsestyle_ns.style.image import load_style_image
-from sparsestyle_ns.whole_files import write_text_whole, write_whole
 
 STEPS_PER_LOOK = 10
 """Iterations between looks at the count of skipped steps, each of which waits for a GPU."""
@@ -72,7 +72,7 @@ class SparseStyleTrainerConfig(TrainerConfig):
             prepare_launch()
         try:
             self.get_base_dir().mkdir(parents=True, exist_ok=True)
-            write_text_whole(self.get_base_dir() / "config.yml", yaml.dump(self))
+            write_whole(self.get_base_dir() / "config.yml", yaml.dump(self))
         except OSError as error:
             raise InputError(
                 f"The run can't be saved in {self.get_base_dir()} ({error.strerror}); name a folder that can be "

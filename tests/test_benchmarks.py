@@ -14,6 +14,7 @@ from nerfstudio.data.scene_box import SceneBox
 from benchmarks import _measure, _scene, effects, nnfm, stability, stage1, summary
 from benchmarks._measure import Duration, Options, Ratio, Report
 from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.evaluation import machine
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
@@ -51,7 +52,7 @@ def options(tmp_path):
 @pytest.fixture(autouse=True)
 def idle_machine(monkeypatch):
     """Spares each test the second of looking at the machine."""
-    monkeypatch.setattr(_measure.psutil, "cpu_percent", lambda interval: 4.0)
+    monkeypatch.setattr(machine.psutil, "cpu_percent", lambda interval: 4.0)
 
 
 # ------------------------------------------------------------------------------------------------------------- timing
@@ -174,31 +175,9 @@ def test_a_stopped_repetition_is_recorded_as_such(options):
 
 
 def test_load_by_other_processes_marks_a_report(options, monkeypatch):
-    monkeypatch.setattr(_measure.psutil, "cpu_percent", lambda interval: 55.0)
+    monkeypatch.setattr(machine.psutil, "cpu_percent", lambda interval: 55.0)
     load = write_report(options)["load_of_others"]
     assert load["before"] == 0.55 and load["busy"]
-
-
-def test_own_work_is_not_load_by_others():
-    def now(elapsed, idle, own):
-        return SimpleNamespace(monotonic=lambda: elapsed), SimpleNamespace(idle=idle), (own, 0, 0, 0, elapsed)
-
-    with pytest.MonkeyPatch.context() as patch:
-
-        def set_now(*state):
-            clock, times, own = now(*state)
-            patch.setattr(_measure, "time", clock)
-            patch.setattr(_measure.psutil, "cpu_times", lambda: times)
-            patch.setattr(_measure.os, "times", lambda: own)
-
-        patch.setattr(_measure.os, "cpu_count", lambda: 2)
-        set_now(0.0, 0.0, 0.0)
-        load = _measure.OtherLoad()
-        # Ten seconds of two cores: 12 s are ours, 5 s are idle, and 3 s are another process'.
-        set_now(10.0, 5.0, 12.0)
-        assert load.record() == {"before": 0.04, "during": 0.15, "busy": True}
-        set_now(10.0, 7.5, 12.0)
-        assert load.record() == {"before": 0.04, "during": 0.025, "busy": False}
 
 
 def test_summary_collects_rows_and_marks_what_misses_its_target(options, tmp_path, capsys):

@@ -1,7 +1,6 @@
 """What a run is worth on the views it hasn't seen: how true the coarse field is, how stylised the stylised one."""
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Dict, List, Optional
@@ -15,6 +14,7 @@ from rich.progress import track
 from torch import Tensor
 
 from sparsestyle_ns.evaluation.image_metrics import image_metrics, psnr
+from sparsestyle_ns.files import write_whole
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import RenderMode
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
@@ -47,10 +47,7 @@ class HeldOutReport:
             "results": self.means,
             "views": self.views,
         }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_name(path.name + ".unfinished")
-        unfinished.write_text(json.dumps(content, indent=2) + "\n")
-        os.replace(unfinished, path)
+        write_whole(path, json.dumps(content, indent=2) + "\n")
 
 
 @torch.no_grad()

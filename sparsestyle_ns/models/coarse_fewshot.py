@@ -87,7 +87,8 @@ class CoarseFewShotModelConfig(ModelConfig):
     frequency_reveal: float = 0.0
     """Share of the iterations in which the encoding's octaves are revealed one by one (FreeNeRF); 0 is off."""
     precision: Precision = "auto"
-    """Number format of matrix products: auto is bfloat16 where the device multiplies it, else float32."""
+    """Number format of matrix products: auto is bfloat16 where the device multiplies it, else float32; tf32 is for
+    GPUs."""
     eval_num_rays_per_chunk: int = 8192
     """Rays rendered at once outside of training."""
     seed: int = 42

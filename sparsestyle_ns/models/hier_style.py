@@ -72,7 +72,8 @@ class HierStyleModelConfig(ModelConfig):
     min_transmittance: float = 1e-3
     """Share of light left, in (0, 1), below which samples farther along the ray are dropped."""
     precision: Precision = "auto"
-    """Number format of matrix products: auto is bfloat16 where the device multiplies it, else float32."""
+    """Number format of matrix products: auto is bfloat16 where the device multiplies it, else float32; tf32 is for
+    GPUs."""
     render_mode: RenderMode = "exact"
     """How pictures are made outside of training. baked keeps the fields in a voxel grid, filled where rays come by: a
     scene's first picture takes as long as an exact one, those from near by a small part of that, also on a CPU. The

@@ -58,6 +58,8 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     """Longer side, in pixels, at which the feature network sees rendered views."""
     style_side: Optional[int] = None
     """Longer side at which it sees the style image: smaller gives finer strokes. None: as feature_side."""
+    style_features: Optional[int] = None
+    """Match with at most so many of the painting's feature vectors, drawn at random; None: all of them."""
     content_weight: float = 10.0
     """λ0, the weight of the content loss at the start (Eq. 6)."""
     content_decay: float = 0.01
@@ -86,13 +88,16 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         """The painting as the feature network sees it.
 
         Raises:
-            InputError: there is no style image or no weights, or they can't be read.
+            InputError: there is no style image or no weights, or they can't be read; style_features is below 1.
         """
         if self.style_image is None:
             raise InputError("There is no style image: name a painting with --style-image FILE.")
+        if self.style_features is not None and self.style_features < 1:
+            raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
         image = load_style_image(self.style_image)
         backbone = load_backbone(self.backbone, self.vgg_weights).to(device)
-        return StyleTargets(backbone, image.to(device), self.feature_side, self.style_side or self.feature_side)
+        style_side = self.style_side or self.feature_side
+        return StyleTargets(backbone, image.to(device), self.feature_side, style_side, self.style_features)
 
 
 @dataclass

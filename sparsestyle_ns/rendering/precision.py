@@ -2,8 +2,8 @@
 
 import functools
 import itertools
-from contextlib import AbstractContextManager
-from typing import Callable, Literal, ParamSpec, TypeVar
+from contextlib import AbstractContextManager, contextmanager
+from typing import Callable, Iterator, Literal, ParamSpec, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -11,7 +11,9 @@ from torch import Tensor
 
 P = ParamSpec("P")
 R = TypeVar("R")
-Precision = Literal["auto", "float32", "bfloat16"]
+Precision = Literal["auto", "float32", "tf32", "bfloat16"]
+"""auto: bfloat16 where the device multiplies it, else float32. tf32: NVIDIA's 19-bit format, in forward passes and from
+Ampere on; elsewhere the same as float32."""
 
 
 def multiplies_bfloat16(device: torch.device) -> bool:
@@ -29,8 +31,25 @@ def autocast(device: torch.device, precision: Precision) -> AbstractContextManag
 
     `auto` is bfloat16 where the device multiplies it (`multiplies_bfloat16`), else float32.
     """
+    if precision == "tf32":
+        return _tensor_float32()
     enabled = precision == "bfloat16" or (precision == "auto" and multiplies_bfloat16(device))
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=enabled)
+
+
+def multiplies_tf32(device: torch.device) -> bool:
+    """Whether the device has instructions for TF32 matrix products."""
+    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
+
+
+@contextmanager
+def _tensor_float32() -> Iterator[None]:
+    products = torch.backends.cuda.matmul
+    before, products.allow_tf32 = products.allow_tf32, True
+    try:
+        yield
+    finally:
+        products.allow_tf32 = before
 
 
 def at_least_float32(values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

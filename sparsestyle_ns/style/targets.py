@@ -31,6 +31,14 @@ def feature_rows(features: Float[Tensor, "B C h w"]) -> Float[Tensor, "rows C"]:
     return features.permute(0, 2, 3, 1).flatten(0, 2)
 
 
+def sample_rows(rows: Float[Tensor, "rows C"], count: int) -> Float[Tensor, "kept C"]:
+    """`count` of the rows, drawn at random but the same each time, in their order; all where there are no more."""
+    if count >= len(rows):
+        return rows
+    drawn = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:count]
+    return rows[drawn.sort().values.to(rows.device)]
+
+
 class StyleTargets:
     """Style and content losses of an image against fixed targets (the two terms of Eq. 5).
 
@@ -41,16 +49,23 @@ class StyleTargets:
         style_image: in [0, 1], on the device of the network.
         feature_side: longer side, in pixels, at which the network sees rendered and content pictures.
         style_side: longer side at which it sees the style image; it sets how large strokes are.
+        style_features: at most so many of the style image's feature vectors count, drawn at random; None: all.
     """
 
     def __init__(
-        self, backbone: VGGFeatures, style_image: Float[Tensor, "3 H W"], feature_side: int, style_side: int
+        self,
+        backbone: VGGFeatures,
+        style_image: Float[Tensor, "3 H W"],
+        feature_side: int,
+        style_side: int,
+        style_features: Optional[int] = None,
     ) -> None:
         self.backbone = backbone
         self.feature_side = feature_side
         self.style_image = style_image
         with torch.no_grad():
-            self.style = StyleIndex(feature_rows(backbone(fit_side(style_image[None], style_side))))
+            rows = feature_rows(backbone(fit_side(style_image[None], style_side)))
+            self.style = StyleIndex(rows if style_features is None else sample_rows(rows, style_features))
 
     def features(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 768 h w"]:
         """The network's view of a picture."""

@@ -3,7 +3,7 @@ from torch import nn
 
 from sparsestyle_ns.losses.content import content_loss
 from sparsestyle_ns.losses.nnfm import nnfm_loss
-from sparsestyle_ns.style.targets import StyleTargets, feature_rows, fit_side
+from sparsestyle_ns.style.targets import StyleTargets, feature_rows, fit_side, sample_rows
 
 
 class Patches(nn.Module):
@@ -48,3 +48,22 @@ def test_what_the_background_shows_changes_no_loss():
     ):
         torch.testing.assert_close(one, other)
     assert targets.losses(first, content)[0] != targets.losses(second, content)[0]
+
+
+def test_with_few_style_features_the_loss_is_that_against_some_of_the_painting():
+    torch.manual_seed(0)
+    picture, image = torch.rand(3, 16, 16), torch.rand(16, 16, 3)
+    losses = []
+    for count in (None, 16, 4, 1):
+        targets = StyleTargets(Patches(), picture, 16, 16, style_features=count)
+        losses.append(float(targets.losses(image, targets.features(image))[0]))
+    assert losses[0] == losses[1]  # there are 16 in all
+    assert losses[1] < losses[2] < losses[3]
+
+
+def test_a_sample_of_rows_keeps_their_order_and_repeats_none():
+    rows = torch.arange(100.0)[:, None]
+    drawn = sample_rows(rows, 30).flatten()
+    assert len(drawn.unique()) == 30
+    assert drawn.equal(drawn.sort().values)
+    assert drawn.equal(sample_rows(rows, 30).flatten())

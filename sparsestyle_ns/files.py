@@ -2,26 +2,32 @@
 
 import os
 from pathlib import Path
-from typing import BinaryIO, Callable, Optional
+from typing import BinaryIO, Callable, Optional, Union
 
 
-def write_whole(target: Path, write: Callable[[BinaryIO], None], temporary: Optional[Path] = None) -> None:
-    """Writes a file that gets its name only when it is whole and on the disk.
+def write_whole(
+    target: Path, content: Union[str, bytes, Callable[[BinaryIO], None]], temporary: Optional[Path] = None
+) -> Path:
+    """Writes a file that gets its name only when it is whole and on the disk; returns its path.
 
     A process that is killed meanwhile leaves the former file as it was, and the unfinished one under another name,
-    which the next call overwrites.
+    which the next call overwrites. Folders on the way to it are made.
 
     Args:
         target: the file to make or to replace.
-        write: writes the content into an open file.
+        content: text, which is written in UTF-8, bytes, or a function that writes them into an open file.
         temporary: where the unfinished file stands, on the same disk; None: beside `target`, as NAME.unfinished.
 
     Raises:
         OSError: the file can't be written; the former one is still there.
     """
+    target.parent.mkdir(parents=True, exist_ok=True)
     unfinished = temporary or target.with_name(target.name + ".unfinished")
     with open(unfinished, "wb") as file:
-        write(file)
+        if callable(content):
+            content(file)
+        else:
+            file.write(content.encode("utf-8") if isinstance(content, str) else content)
         file.flush()
         os.fsync(file.fileno())
     os.replace(unfinished, target)
@@ -30,8 +36,4 @@ def write_whole(target: Path, write: Callable[[BinaryIO], None], temporary: Opti
         os.fsync(folder)
     finally:
         os.close(folder)
-
-
-def write_text_whole(target: Path, text: str) -> None:
-    """Writes a UTF-8 text file with `write_whole`."""
-    write_whole(target, lambda file: file.write(text.encode("utf-8")))
+    return target

@@ -1,0 +1,119 @@
+"""The machine that something is measured on: what it is, whether others use it, and how much memory is taken."""
+
+import importlib.metadata
+import os
+import platform
+import resource
+import sys
+import time
+from pathlib import Path
+from typing import Any, Dict, List, Tuple
+
+import psutil
+import torch
+
+PACKAGES = ("torch", "numpy", "nerfstudio", "numba")
+BUSY_SHARE = 0.1
+"""Share of all cores that other processes may use before a figure is marked."""
+SHORTEST_WINDOW = 0.5
+"""Seconds over which load is averaged at least: the system counts time in steps of 10 ms."""
+
+
+def synchronize(device: torch.device) -> None:
+    """Waits until a GPU has done what it was told."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def peak_bytes(device: torch.device) -> int:
+    """The most memory this process has had: of a GPU what torch had allocated, else all that was resident."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    status = Path("/proc/self/status")
+    if status.is_file():
+        # Unlike getrusage's figure, this one isn't inherited from the process that started this one.
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def core_seconds() -> Tuple[float, float]:
+    """Seconds that all cores together have had, and those of them in which another process ran."""
+    times = psutil.cpu_times()
+    cores = (os.cpu_count() or 1) * time.monotonic()
+    own = sum(os.times()[:4])  # with those of processes that it started, once they have ended
+    return cores, cores - times.idle - getattr(times, "iowait", 0.0) - own
+
+
+def others_share(earlier: Tuple[float, float], later: Tuple[float, float]) -> float:
+    """Share of all cores, in [0, 1], that other processes used between two readings of `core_seconds`."""
+    cores, others = later[0] - earlier[0], later[1] - earlier[1]
+    return min(1.0, max(0.0, others / max(cores, 1e-9)))
+
+
+class OtherLoad:
+    """How much of all cores other processes use: for a second before a benchmark, and on average while it runs."""
+
+    def __init__(self) -> None:
+        self.before = psutil.cpu_percent(interval=1.0) / 100
+        self._start = core_seconds()
+
+    def record(self) -> Dict[str, Any]:
+        """Both shares, in [0, 1], and whether the machine counts as busy."""
+        during = others_share(self._start, core_seconds())
+        return {
+            "before": round(self.before, 3),
+            "during": round(during, 3),
+            "busy": max(self.before, during) > BUSY_SHARE,
+        }
+
+
+class LoadWatch:
+    """Says of each of many measurements whether other processes kept the machine busy meanwhile.
+
+    Use it as a context manager around each; `busy` then is the answer for the latest. A measurement shorter than
+    `SHORTEST_WINDOW` is judged together with what came right before it.
+    """
+
+    def __init__(self) -> None:
+        self.busy = False
+        self._readings: List[Tuple[float, float]] = [core_seconds()]
+
+    def __enter__(self) -> "LoadWatch":
+        self._readings.append(core_seconds())
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        now = core_seconds()
+        window = SHORTEST_WINDOW * (os.cpu_count() or 1)
+        start = self._readings[-1]
+        for reading in reversed(self._readings):
+            start = reading
+            if now[0] - reading[0] >= window:
+                break
+        self._readings = [reading for reading in self._readings if reading[0] >= start[0]]
+        self.busy = others_share(start, now) > BUSY_SHARE
+
+
+def device_name(device: torch.device) -> str:
+    """The GPU's name, or the CPU's model."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    information = Path("/proc/cpuinfo")
+    if information.is_file():
+        for line in information.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def versions() -> Dict[str, str]:
+    """Versions of Python and of the packages that matter, as far as they are installed."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
