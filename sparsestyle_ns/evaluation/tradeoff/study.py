@@ -500,7 +500,11 @@ class Study:
         if self.style_model is None:
             if self.coarse_state is None:
                 raise OutOfTimeError
-            model = self._setup_pipeline(self.adapted_style_config()).model
+            config = self.adapted_style_config()
+            cells, coarse = config.pipeline.model.occupancy_resolution**3, self.coarse_config.pipeline.model
+            # Finding the empty cells can't be stopped on the way.
+            self.budget.check(cells * self.coarse_view_seconds / (self.pixels * coarse.num_eval_samples))
+            model = self._setup_pipeline(config).model
             model.adopt_coarse(self.coarse_state)
             self.style_model = model.eval()
         return self.style_model

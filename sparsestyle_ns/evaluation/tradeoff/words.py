@@ -2,7 +2,7 @@
 
 from typing import List, Optional, Sequence
 
-from sparsestyle_ns.evaluation.tradeoff.axis import Axis, Point
+from sparsestyle_ns.evaluation.tradeoff.axis import FREE_LOSS, Axis, Point
 from sparsestyle_ns.evaluation.tradeoff.pareto import decibels_lost, time_factor_of_a_decibel
 
 SMALL_GAIN = 0.05
@@ -94,14 +94,20 @@ def setting_line(axis: Axis) -> str:
     if chosen.setting == preset.setting:
         return f"{head}keep {preset.setting}{_instead(axis, preset)}" + _mark(chosen, preset)
     # Runs of one length end at the same time: their ends are what can be compared.
-    if axis.has_runs:
-        chosen = axis.last(chosen.setting) or chosen
-        gain = axis.error_of(chosen) / max(axis.error_of(preset), 1e-12) - 1.0
-        if gain > -SMALL_GAIN and chosen.median(axis.time) > preset.median(axis.time) * (1 - SMALL_GAIN):
-            return f"{head}keep {preset.setting}; {_compared(axis, chosen, preset)}" + _mark(chosen, preset)
-    return f"{head}{chosen.setting} instead of {preset.setting}: {_compared(axis, chosen, preset)}" + _mark(
-        chosen, preset
-    )
+    chosen = axis.last(chosen.setting) or chosen
+    compared = f"{_compared(axis, chosen, preset)}" + _mark(chosen, preset)
+    if is_worth_a_change(axis, chosen, preset):
+        return f"{head}{chosen.setting} instead of {preset.setting}: {compared}"
+    return f"{head}keep {preset.setting}; {chosen.setting}: {compared}"
+
+
+def is_worth_a_change(axis: Axis, chosen: Point, preset: Point) -> bool:
+    """Whether a setting is faster or more accurate than the preset's by more than measurements wander."""
+    if preset.median(axis.time) / chosen.median(axis.time) > ALSO_KEEP:
+        return True
+    if axis.own_error is not None:
+        return decibels_lost(axis.error_of(preset), axis.own_error) > FREE_LOSS
+    return axis.error_of(chosen) < (1.0 - SMALL_GAIN) * axis.error_of(preset)
 
 
 def order_in_words(axis: Axis) -> str:

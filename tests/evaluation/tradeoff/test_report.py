@@ -128,6 +128,13 @@ def test_the_observed_order_is_said():
     assert recommendation([axis])[0].endswith("Observed order of convergence: 1.5.")
 
 
+def test_a_setting_that_is_hardly_faster_is_no_reason_to_change():
+    axis = quadrature_axis(errors=(0.001, 0.001, 0.001), preset="32")
+    axis.points[0].values["view_seconds"] = [3.5]  # 16 samples take as long as 32, but for a hair
+    assert axis.recommended.setting == "16"
+    assert "keep 32; 16: " in setting_line(axis)
+
+
 def test_of_runs_the_ends_are_compared():
     assert "128 instead of 256: 19.00 dB instead of 18.00" in setting_line(width_axis())
     assert "keep 256" in setting_line(width_axis(narrow=17.0))
