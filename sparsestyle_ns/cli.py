@@ -57,8 +57,9 @@ def evaluate(
 ) -> None:
     """Measures a run on the views it hasn't seen.
 
-    Coarse: PSNR, SSIM, LPIPS where its weights are on the machine, and effective samples a ray. Stylised: the coarse
-    field's quality, and style and content loss before and after stylising.
+    Coarse: PSNR, SSIM, LPIPS where its weights are on the machine, ST-LPIPS, and effective samples a ray. Stylised: the
+    coarse field's quality; style strength and what is kept of the content; and short- and long-range consistency on a
+    path of cameras between the training views, beside that of the unstylised scene.
 
     Args:
         run: The run's folder or its config.yml.
@@ -67,11 +68,12 @@ def evaluate(
         baked: Also measure how close a stylised run's baked renders are to exact ones (PSNR in dB).
     """
     from sparsestyle_ns.evaluation.held_out import evaluate_run
+    from sparsestyle_ns.evaluation.tables import report_tables
     from sparsestyle_ns.run_folder import find_config
 
     report = evaluate_run(find_config(run), output_path, style_image, baked)
-    for name, value in report.means.items():
-        print(f"{name:>20} {value:9.4f}")
+    for table in report_tables(report.means, len(report.views)):
+        table.print()
     print(f"{len(report.views)} held-out views; the report is {output_path}")
 
 

@@ -1,11 +1,13 @@
 """What the pipelines of both methods have in common."""
 
-from typing import Any, Dict, Literal
+from pathlib import Path
+from typing import Any, Dict, Literal, Optional
 
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
 from sparsestyle_ns.errors import InputError, exit_on_input_error
 from sparsestyle_ns.ffmpeg import put_ffmpeg_on_path
+from sparsestyle_ns.style.targets import StyleTargets
 
 TestMode = Literal["test", "val", "inference"]
 
@@ -20,6 +22,22 @@ class CheckedPipeline(VanillaPipeline):
         super().__init__(config, device, test_mode, *args, **kwargs)
         if test_mode != "val":
             put_ffmpeg_on_path()
+
+    def painting(self) -> Optional[StyleTargets]:
+        """The painting to measure against, where the method has one and it is still there."""
+        return None
+
+    @exit_on_input_error
+    def get_average_eval_image_metrics(
+        self, step: Optional[int] = None, output_path: Optional[Path] = None, get_std: bool = False
+    ) -> Dict[str, float]:
+        """The figures of `sparsestyle evaluate`, for `ns-eval`, with the time that rendering took."""
+        from sparsestyle_ns.evaluation.held_out import evaluate_held_out
+
+        self.eval()
+        report = evaluate_held_out(self, self.painting(), picture_folder=output_path)
+        self.train()
+        return {**report.means, **(report.deviations() if get_std else {}), **report.speed()}
 
     @exit_on_input_error
     def load_pipeline(self, loaded_state: Dict[str, Any], step: int) -> None:
