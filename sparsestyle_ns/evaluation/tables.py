@@ -33,12 +33,14 @@ class Table:
         columns: headings of the columns after the first.
         rows: each row's name and cells; None is an empty one.
         note: a sentence below it.
+        cited: names of rows whose figures are others', not measured here.
     """
 
     title: str
     columns: Sequence[str]
     rows: List[Tuple[str, List[Optional[str]]]] = field(default_factory=list)
     note: str = ""
+    cited: Tuple[str, ...] = ()
 
     def print(self) -> None:
         """Prints it."""
@@ -47,7 +49,7 @@ class Table:
         for column in self.columns:
             table.add_column(column, justify="right")
         for name, cells in self.rows:
-            table.add_row(name, *(cell or "–" for cell in cells))
+            table.add_row(name, *(cell or "–" for cell in cells), style="italic dim" if name in self.cited else None)
         Console().print(table)
 
 
