@@ -137,8 +137,14 @@ class Laboratory:
             after_stop: called when an experiment has reached one of its stops, with that iteration.
 
         Raises:
-            InputError: a run failed.
+            InputError: a run failed, or Ctrl-C was pressed; either way what is done is kept.
         """
+        try:
+            self._run(experiments, after_stop)
+        except KeyboardInterrupt as interrupt:
+            raise InputError("Interrupted; the same command goes on where it was.") from interrupt
+
+    def _run(self, experiments: Sequence[Experiment], after_stop: Optional[AfterStop]) -> None:
         styled = list(dict.fromkeys(experiments))
         coarse = list(dict.fromkeys(each.coarse for each in styled if each.coarse is not None))
         wanted = [*coarse, *(each for each in styled if each not in coarse)]
@@ -146,9 +152,17 @@ class Laboratory:
         self.say(self.forecast(wanted, left))
         for stage in (coarse, styled):
             todo = [each for each in stage if each in left]
-            jobs = min(self._jobs(), max(1, len(todo)))
+            jobs = min(self._jobs(), len(todo))
+            if jobs < 2:
+                for each in todo:
+                    self._train(each, 1, after_stop)
+                continue
             with ThreadPoolExecutor(jobs) as pool:
-                list(pool.map(lambda each, jobs=jobs: self._train(each, jobs, after_stop), todo))
+                try:
+                    list(pool.map(lambda each, jobs=jobs: self._train(each, jobs, after_stop), todo))
+                except BaseException:
+                    pool.shutdown(cancel_futures=True)
+                    raise
 
     def forecast(self, wanted: Sequence[Experiment], left: Sequence[Experiment]) -> str:
         """How much is to do and how long it will take, by what earlier runs of the same methods took."""
@@ -183,7 +197,8 @@ class Laboratory:
         for iterations in (*experiment.stops, experiment.iterations):
             if experiment.steps_done(self.scene) < iterations:
                 self._train_to(experiment, iterations, jobs)
-            if after_stop is not None and experiment.steps_done(self.scene) == iterations:
+            is_stop = iterations in experiment.stops and experiment.steps_done(self.scene) == iterations
+            if after_stop is not None and is_stop:
                 with self._one_at_a_time:
                     after_stop(experiment, iterations)
 
@@ -213,6 +228,9 @@ class Laboratory:
         while process.poll() is None:
             try:
                 process.wait(timeout=2)
+            except KeyboardInterrupt:  # the run got it too, and saves what it has
+                process.wait()
+                raise
             except subprocess.TimeoutExpired:
                 if time.monotonic() - said >= 60:
                     said = time.monotonic()

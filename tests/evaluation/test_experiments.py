@@ -64,7 +64,7 @@ def test_a_coarse_run_comes_first_and_once_and_stops_are_called_on_the_way(labor
         ("ours-ours", 4, 6),
         ("ours-arf", 0, 6),
     ]
-    assert stops == [("ours", 10), ("ours-ours", 2), ("ours-ours", 4), ("ours-ours", 6), ("ours-arf", 6)]
+    assert stops == [("ours-ours", 2), ("ours-ours", 4)]
 
 
 def test_finished_runs_are_not_done_again_and_interrupted_ones_are_gone_on_with(laboratory: Laboratory) -> None:
@@ -134,6 +134,19 @@ def test_a_run_that_fails_is_named_with_its_log(laboratory: Laboratory, monkeypa
     monkeypatch.setattr(Experiment, "command", lambda *_: fail)
     with pytest.raises(InputError, match=r"ours-[0-9a-f]{8} didn't finish \(Error: the scene is gone\).*\.log"):
         laboratory.run([COARSE])
+
+
+def test_after_ctrl_c_nothing_more_is_begun(laboratory: Laboratory, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = []
+
+    def interrupt(self: Laboratory, experiment: Experiment, *_: object) -> None:
+        begun.append(experiment.name)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Laboratory, "_train", interrupt)
+    with pytest.raises(InputError, match="goes on where it was"):
+        laboratory.run([Experiment(str(number), "hier-style", 1, (str(number),)) for number in range(8)])
+    assert begun == ["0"]
 
 
 def test_runs_beside_each_other_share_the_cores(laboratory: Laboratory, monkeypatch: pytest.MonkeyPatch) -> None:

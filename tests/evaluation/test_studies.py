@@ -10,6 +10,7 @@ import pytest
 import tyro
 from conftest import TINY, TINY_STYLE
 from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.utils import writer
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.evaluation import comparison
@@ -89,6 +90,8 @@ def train_here(monkeypatch: pytest.MonkeyPatch) -> list:
 
     def train_to(self: Laboratory, experiment: Experiment, iterations: int, jobs: int) -> None:
         trained.append((experiment.name, iterations))
+        for state in (writer.EVENT_WRITERS, writer.EVENT_STORAGE, writer.GLOBAL_BUFFER):
+            state.clear()  # one process, one run: that is how nerfstudio keeps them
         train.main(parse(experiment, self.scene, iterations))
 
     monkeypatch.setattr(Laboratory, "_train_to", train_to)
