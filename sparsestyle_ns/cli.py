@@ -89,8 +89,9 @@ class StudyOptions:
     """Paintings; each is a table of its own."""
     output_path: Path
     """The HTML page to write."""
-    output_dir: Path = Path("outputs")
-    """Where the runs are; those that are there are used."""
+    output_dir: Path = Path("outputs/studies")
+    """Where the runs are; those that are there are used. Apart from other runs: hier-style takes the newest coarse run
+    below its own --output-dir, and must not find an ablation's."""
     parser: str = "llff-data"
     """nerfstudio's name of the scene's dataparser."""
     max_image_side: Optional[int] = None

@@ -10,6 +10,8 @@ from nerfstudio.cameras.camera_utils import get_interpolated_poses
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from sparsestyle_ns.errors import InputError
+
 NUM_FRAMES = 24
 """Frames of the path, at least."""
 ARC_STEP = math.radians(2.0)
@@ -29,10 +31,10 @@ def measuring_path(cameras: Cameras) -> Cameras:
         cameras: the training cameras, two or more.
 
     Raises:
-        ValueError: there are fewer than two.
+        InputError: there are fewer than two.
     """
     if len(cameras) < 2:
-        raise ValueError(f"a path needs two training cameras, and there are {len(cameras)}")
+        raise InputError("Consistency is measured between training views, and there is one; train on two or more.")
     poses = cameras.camera_to_worlds.cpu().float()
     forward = -poses[:, :, 2]
     mean = torch.nn.functional.normalize(forward.mean(dim=0), dim=0)

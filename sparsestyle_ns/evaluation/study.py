@@ -44,6 +44,8 @@ FINE_TUNING = (
     *("--pipeline.model.stylised-field", "coarse"),
     *("--optimizers.fields.optimizer.lr", "5e-4"),
     *("--pipeline.content-weight", "0.1", "--pipeline.content-decay", "1"),
+    # A sample's activations take twice the memory that the residual field's do, and are all kept.
+    *("--pipeline.samples-per-chunk", "131072"),
 )
 
 

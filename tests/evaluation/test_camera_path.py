@@ -6,6 +6,7 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
+from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.camera_path import ARC_STEP, NUM_FRAMES, axes_meet, measuring_path
 
 
@@ -67,5 +68,5 @@ def test_optical_axes_meet_where_the_cameras_look() -> None:
 
 
 def test_one_camera_makes_no_path() -> None:
-    with pytest.raises(ValueError, match="two training cameras"):
+    with pytest.raises(InputError, match="train on two or more"):
         measuring_path(row(3)[:1])

@@ -148,6 +148,16 @@ def test_compare_trains_what_is_missing_measures_each_row_and_writes_the_page(
     assert not any(escape(name) in page for name in two_dimensional)
 
 
+def test_a_run_is_one_of_ns_train_in_a_process_of_its_own(llff_scene: Path, tmp_path: Path) -> None:
+    scene = SceneSettings(llff_scene, "llff-data", tmp_path, ("--num-views", "2"))
+    run, said = Study(scene, False, tuple(TINY), coarse_iterations=2).coarse("freenerf"), []
+    Laboratory(scene, 1, said.append).run([run])
+    assert run.is_finished(scene)
+    assert json.loads((run.folder(scene) / "scene.json").read_text())["view_ids"] == [1, 11]
+    assert (run.folder(scene) / "config.yml").is_file()
+    assert said[-1].startswith(f"{run.folder(scene).name}: 2 iterations in")
+
+
 def test_figures_are_measured_again_when_a_run_has_gone_on(
     llff_scene: Path, painting: Path, tmp_path: Path, train_here: list
 ) -> None:
