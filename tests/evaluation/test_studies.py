@@ -3,22 +3,26 @@
 import copy
 import json
 import re
+import shutil
 from html import escape
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import tyro
 from conftest import TINY, TINY_STYLE
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils import writer
+from PIL import Image
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.evaluation import comparison
 from sparsestyle_ns.evaluation import study as study_module
-from sparsestyle_ns.evaluation.ablations import GROUPS, ablation_experiments, annealing_plots, moving_mean
+from sparsestyle_ns.evaluation.ablations import GROUPS, ablate, ablation_experiments, annealing_plots, moving_mean
 from sparsestyle_ns.evaluation.comparison import PAPER_ROWS, comparison_experiments
 from sparsestyle_ns.evaluation.experiments import Experiment, Laboratory, SceneSettings
-from sparsestyle_ns.evaluation.study import STYLE_KINDS, Study
+from sparsestyle_ns.evaluation.study import STYLE_KINDS, Study, picture_after
+from sparsestyle_ns.evaluation.study_page import write_study
 from sparsestyle_ns.method_configs import method_config
 
 
@@ -176,6 +180,26 @@ def test_figures_are_measured_again_when_a_run_has_gone_on(
     content = json.loads(record.read_text())
     record.write_text(json.dumps({**content, "step": 0, "figures": {}}))
     assert measure_run(whole.folder(scene), Painter(painting)).figures == pytest.approx(first.figures)
+
+
+def test_ablations_set_out_each_group_with_traces_and_pictures_on_the_way(
+    runs: SimpleNamespace, painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    coarse, style = (shutil.copytree(run, tmp_path / "s" / run.parent.name / "r") for run in (runs.coarse, runs.style))
+    Image.new("RGB", (32, 24)).save(picture_after(style, 20))
+    monkeypatch.setattr(Experiment, "folder", lambda experiment, _: coarse if experiment.coarse is None else style)
+    monkeypatch.setattr(Laboratory, "run", lambda *_: None)
+    sections = ablate(study(), [painting], Laboratory(study().scene, 1))
+    assert [section.heading.split(":")[0] for section in sections[1:]] == list(GROUPS)
+    assert [name for name, _ in sections[0].tables[0].rows] == ["ours", "vanilla", "freenerf"]
+    for section, (_, rows) in zip(sections[1:], GROUPS.values(), strict=True):
+        assert [name for name, _ in section.tables[0].rows][: len(rows)] == list(rows)
+    annealing = sections[-1]
+    assert [len(section.plots) for section in sections] == [0, 0, 0, 0, 3]
+    assert [caption for caption, _ in annealing.grid[0][1]] == ["after 20 iterations", "at the end"]
+    page = write_study(sections, tmp_path / "ablations.html", "Ablations").read_text()
+    assert page.count("data:image/svg+xml") == 3
+    assert not re.findall(r'(?:src|href)="(?!data:)', page)
 
 
 @pytest.mark.slow
