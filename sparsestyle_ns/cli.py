@@ -4,7 +4,9 @@ A subcommand is a function here: its arguments and docstring are the command lin
 when it runs, so that help is there at once.
 """
 
+import shlex
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Callable, Dict, Literal, Optional, Sequence, Tuple
 
@@ -58,8 +60,9 @@ def evaluate(
 ) -> None:
     """Measures a run on the views it hasn't seen.
 
-    Coarse: PSNR, SSIM, LPIPS where its weights are on the machine, and effective samples a ray. Stylised: the coarse
-    field's quality, and style and content loss before and after stylising.
+    Coarse: PSNR, SSIM, LPIPS where its weights are on the machine, ST-LPIPS, and effective samples a ray. Stylised: the
+    coarse field's quality; style strength and what is kept of the content; and short- and long-range consistency on a
+    path of cameras between the training views, beside that of the unstylised scene.
 
     Args:
         run: The run's folder or its config.yml.
@@ -68,11 +71,12 @@ def evaluate(
         baked: Also measure how close a stylised run's baked renders are to exact ones (PSNR in dB).
     """
     from sparsestyle_ns.evaluation.held_out import evaluate_run
+    from sparsestyle_ns.evaluation.tables import report_tables
     from sparsestyle_ns.run_folder import find_config
 
     report = evaluate_run(find_config(run), output_path, style_image, baked)
-    for name, value in report.means.items():
-        print(f"{name:>20} {value:9.4f}")
+    for table in report_tables(report.means, len(report.views)):
+        table.print()
     print(f"{len(report.views)} held-out views; the report is {output_path}")
 
 
@@ -172,7 +176,104 @@ def tradeoff(
     )
 
 
+@dataclass
+class StudyOptions:
+    """What `compare` and `ablate` are run on."""
+
+    data: Path
+    """Folder of the scene."""
+    style_images: Tuple[Path, ...]
+    """Paintings; each is a table of its own."""
+    output_path: Path
+    """The HTML page to write."""
+    output_dir: Path = Path("outputs/studies")
+    """Where the runs are; those that are there are used. Apart from other runs: hier-style takes the newest coarse run
+    below its own --output-dir, and must not find an ablation's."""
+    parser: str = "llff-data"
+    """nerfstudio's name of the scene's dataparser."""
+    max_image_side: Optional[int] = None
+    """Longer side, in pixels, that photos are reduced to; None: the methods' own limit."""
+    draft: bool = False
+    """Whether to run the drafts of both methods."""
+    coarse_iterations: Optional[int] = None
+    """Iterations of stage 1; None: the method's own."""
+    style_iterations: Optional[int] = None
+    """Iterations of stage 2; None: the method's own."""
+    coarse_flags: str = ""
+    """More flags of ns-train for all runs of stage 1, with an equals sign: --coarse-flags='--flag value'."""
+    style_flags: str = ""
+    """The same for all runs of stage 2: --style-flags='--flag value'."""
+    jobs: Optional[int] = None
+    """Runs at a time; None: one, or one for every four CPU cores where there is no GPU."""
+
+
+@exit_on_input_error
+def compare(options: Annotated[StudyOptions, tyro.conf.arg(name="")]) -> None:
+    """Runs the paper's comparison on a scene: baselines and ours, in one table and one grid beside the paper's rows.
+
+    Rows: frame-by-frame 2D transfer of the coarse renders (needs `pip install -e .[compare]`), the same smoothed along
+    the optical flow, fine-tuning the coarse field (ARF's kind), a FreeNeRF-style field fine-tuned, and ours.
+    Interrupted, the same command goes on where it was.
+    """
+    from sparsestyle_ns.evaluation.comparison import compare as run
+
+    _write_study(options, run, "Comparison")
+
+
+@exit_on_input_error
+def ablate(options: Annotated[StudyOptions, tyro.conf.arg(name="")]) -> None:
+    """Runs the paper's ablations on a scene, and sets them out on one page.
+
+    Stage 1 as vanilla NeRF, as ours and with FreeNeRF's regularisers, each with our stage 2 and fine-tuned; stage 2
+    with e_c only, with sines and cosines for the hash grid, without residual density, with constant content weights.
+    Interrupted, the same command goes on where it was; runs that `compare` has made are used.
+    """
+    from sparsestyle_ns.evaluation.ablations import ablate as run
+
+    _write_study(options, run, "Ablations")
+
+
+def _write_study(options: StudyOptions, run: Callable[..., Any], title: str) -> None:
+    from sparsestyle_ns.evaluation.experiments import Laboratory, SceneSettings
+    from sparsestyle_ns.evaluation.study import Study
+    from sparsestyle_ns.evaluation.study_page import write_study
+    from sparsestyle_ns.gallery import prepare_folder
+    from sparsestyle_ns.style.image import load_style_image
+
+    if not options.data.exists():
+        raise InputError(f"There is no scene at --data {options.data}; name its folder.")
+    if not options.style_images:
+        raise InputError("There is no painting; name at least one with --style-images.")
+    if options.jobs is not None and options.jobs < 1:
+        raise InputError(f"--jobs is {options.jobs}; at least one run at a time is needed.")
+    for painting in options.style_images:
+        load_style_image(painting)
+    prepare_folder(options.output_path)
+    side = options.max_image_side
+    scene = SceneSettings(
+        options.data,
+        options.parser,
+        options.output_dir,
+        () if side is None else ("--max-image-side", str(side)),
+    )
+    study = Study(
+        scene,
+        options.draft,
+        tuple(shlex.split(options.coarse_flags)),
+        tuple(shlex.split(options.style_flags)),
+        options.coarse_iterations,
+        options.style_iterations,
+    )
+    sections = run(study, options.style_images, Laboratory(scene, options.jobs))
+    for section in sections:
+        for table in section.tables:
+            table.print()
+    print(f"The page is {write_study(sections, options.output_path, f'{title}: {scene.name}')}")
+
+
 SUBCOMMANDS: Dict[str, Callable[..., Any]] = {
+    "ablate": ablate,
+    "compare": compare,
     "effects": effects,
     "evaluate": evaluate,
     "gallery": gallery,

@@ -103,7 +103,11 @@ def write_page(runs: Sequence[RunPictures], output_path: Path, title: str) -> Pa
     Raises:
         InputError: it can't be written there.
     """
-    page = page_html(runs, title)
+    return write_document(page_html(runs, title), output_path)
+
+
+def write_document(page: str, output_path: Path) -> Path:
+    """Writes a whole HTML page as `write_page` does."""
     prepare_folder(output_path)
     try:
         handle, unfinished = tempfile.mkstemp(prefix=".gallery-", dir=output_path.parent)
@@ -146,6 +150,17 @@ def page_html(runs: Sequence[RunPictures], title: str) -> str:
     """The whole page as HTML."""
     contents = "" if len(runs) < 2 else _contents(runs)
     sections = "".join(_section(run, f"run-{number}") for number, run in enumerate(runs, start=1))
+    return document(title, contents, sections)
+
+
+def document(title: str, contents: str, sections: str) -> str:
+    """A page in this package's style that needs nothing else.
+
+    Args:
+        title: its heading, plain text.
+        contents: HTML below the heading.
+        sections: HTML of its body.
+    """
     body = (
         f'<header class="top"><h1>{escape(title)}</h1>{contents}</header>\n'
         f"<main>\n{sections}</main>\n<script>{SCRIPT}</script>"
@@ -184,7 +199,8 @@ def _image(pixels: Pixels, alternative: str, name: str = "") -> str:
     return f'<img{names} src="{data_uri(pixels)}" width="{width}" height="{height}" alt="{escape(alternative)}">'
 
 
-def _figure(pixels: Pixels, caption: str, alternative: Optional[str] = None) -> str:
+def figure(pixels: Pixels, caption: str, alternative: Optional[str] = None) -> str:
+    """A picture with its caption, as HTML; both texts are plain."""
     return f"<figure>{_image(pixels, alternative or caption)}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
@@ -211,11 +227,11 @@ def _video(video: Optional[bytes]) -> str:
 
 
 def _sources(run: RunPictures) -> str:
-    photos = "".join(_figure(photo.pixels, photo.caption) for photo in run.photos)
+    photos = "".join(figure(photo.pixels, photo.caption) for photo in run.photos)
     if run.style is None:
         style = f'<p class="note">{escape(run.style_note)}</p>'
     else:
-        style = _figure(run.style.pixels, run.style.caption)
+        style = figure(run.style.pixels, run.style.caption)
     columns = 4 if len(run.photos) in (4, 7, 8) else 3
     count = "One photo" if len(run.photos) == 1 else f"{len(run.photos)} photos"
     return (
@@ -233,7 +249,7 @@ def _views(views: Sequence[View]) -> str:
         cells = {"Photo": view.photo, "Coarse": view.coarse, "Stylised": view.stylised, "Depth": view.depth}
         there = {caption: pixels for caption, pixels in cells.items() if pixels is not None}
         columns.add(tuple(there))
-        figures = "".join(_figure(pixels, caption, f"{caption}, {view.name}") for caption, pixels in there.items())
+        figures = "".join(figure(pixels, caption, f"{caption}, {view.name}") for caption, pixels in there.items())
         rows.append(f'<div class="view"><h4>{escape(view.name)}</h4><div class="cells">{figures}</div></div>')
     names = "views aligned" if len(columns) == 1 else "views"
     return f'<div class="{names}"><h3>From other viewpoints</h3>{"".join(rows)}</div>\n'
@@ -320,10 +336,15 @@ dd { overflow-wrap: anywhere; }
 .figures dd { font-family: var(--serif); font-size: 1.75rem; line-height: 1.25; font-variant-numeric: lining-nums; }
 .settings dl { grid-template-columns: repeat(auto-fill, minmax(14rem, 1fr)); }
 .settings dd { font-size: 0.9375rem; }
-.scroll { overflow-x: auto; }
-.effects table { width: 100%; border-collapse: collapse; font-size: 0.875rem; }
-.effects th, .effects td { border-top: 1px solid var(--line); padding: 0.375rem 1rem 0.375rem 0; text-align: left; }
-.effects th { border-top: 0; color: var(--soft); font-weight: 400; }
+.scroll { overflow-x: auto; margin: 0.75rem 0 1.5rem; }
+table { border-collapse: collapse; font-size: 0.875rem; font-variant-numeric: tabular-nums; }
+th, td { border-bottom: 1px solid var(--line); padding: 0.35rem 0.9rem 0.35rem 0; text-align: right; }
+th:first-child, td:first-child { text-align: left; }
+th { color: var(--soft); font-weight: 500; }
+tr.cited td { color: var(--soft); font-style: italic; }
+.plot img { background: #fff; max-width: 46rem; }
+.effects table { width: 100%; }
+.effects th, .effects td { text-align: left; }
 @media (max-width: 46rem) {
   .sources { flex-direction: column; align-items: stretch; gap: 1rem; }
   .photos, .painting { flex: none; }

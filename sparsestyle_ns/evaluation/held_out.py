@@ -1,29 +1,33 @@
 """What a run is worth on the views it hasn't seen: how true the coarse field is, how stylised the stylised one."""
 
 import json
+import statistics
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Dict, List, Optional
 
 import torch
 from jaxtyping import Float
-from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.models.base_model import Model
-from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from rich.progress import track
 from torch import Tensor
+from torchvision.utils import save_image
 
+from sparsestyle_ns.evaluation.camera_path import measuring_path
 from sparsestyle_ns.evaluation.image_metrics import image_metrics, psnr
+from sparsestyle_ns.evaluation.path_frames import render_path
+from sparsestyle_ns.evaluation.style_strength import gram_distance, gram_matrix
 from sparsestyle_ns.files import write_whole
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
-from sparsestyle_ns.models.hier_style import RenderMode
+from sparsestyle_ns.models.hier_style import HierStyleModel
+from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 from sparsestyle_ns.rendering.compositing import dense_weights, effective_samples, optical_depth
 from sparsestyle_ns.rendering.density_grid import interval_lengths
 from sparsestyle_ns.rendering.precision import autocast
 from sparsestyle_ns.rendering.sampling import even_edges
 from sparsestyle_ns.run_folder import load_run
-from sparsestyle_ns.style.targets import StyleTargets
+from sparsestyle_ns.style.targets import StyleTargets, covered_rows
 
 EVEN_SAMPLES = 64
 """Even samples a ray on which `mean_effective_samples` counts: the number means something only with this one."""
@@ -33,10 +37,33 @@ MIN_ACCUMULATION = 0.5
 
 @dataclass
 class HeldOutReport:
-    """Means over the held-out views, and the values of each view."""
+    """What was measured of a run.
+
+    Attributes:
+        means: means over the held-out views, and for a stylised run those over pairs of the measuring path.
+        views: the held-out views' own values.
+        rays: each view's pixels.
+        seconds: how long each view took to render.
+    """
 
     means: Dict[str, float]
     views: List[Dict[str, float]]
+    rays: List[int]
+    seconds: List[float]
+
+    def deviations(self) -> Dict[str, float]:
+        """As `…_std`, the standard deviations between views; nothing where there is one view."""
+        if len(self.views) < 2:
+            return {}
+        return {f"{key}_std": statistics.stdev(view[key] for view in self.views) for key in self.views[0]}
+
+    def speed(self) -> Dict[str, float]:
+        """`num_rays_per_sec` and `fps`, means over the views."""
+        rates = [rays / seconds for rays, seconds in zip(self.rays, self.seconds, strict=True)]
+        return {
+            "num_rays_per_sec": statistics.fmean(rates),
+            "fps": statistics.fmean(1.0 / seconds for seconds in self.seconds),
+        }
 
     def save(self, path: Path, experiment: str, method: str, step: int) -> None:
         """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means."""
@@ -52,26 +79,34 @@ class HeldOutReport:
 
 @torch.no_grad()
 def evaluate_held_out(
-    pipeline: VanillaPipeline, targets: Optional[StyleTargets] = None, baked: bool = False
+    pipeline: CheckedPipeline,
+    targets: Optional[StyleTargets] = None,
+    baked: bool = False,
+    picture_folder: Optional[Path] = None,
 ) -> HeldOutReport:
-    """Evaluates a loaded run of either method on all views of its evaluation split.
+    """Evaluates a loaded run of either method on all views of its evaluation split, and on the measuring path.
 
-    Coarse run: `psnr` in dB, `ssim`, `lpips` where its weights exist, and `effective_samples`. Stylised run: the same
-    of the coarse field with the prefix `coarse_`, `content_ssim`, and with `targets` the style loss of the coarse and
-    the stylised render (`style_loss_before`, `style_loss`), and `content_loss` against the coarse render. All of these
-    are of exact renders.
+    Coarse run: `psnr` in dB, `ssim`, `lpips` and `st_lpips` where there are weights, and `effective_samples`. Stylised
+    run: the same of the coarse field with the prefix `coarse_`; `content_ssim`; with `targets` what
+    `stylisation_figures` gives; and the consistency of frames on the measuring path (`PathFrames.figures`), where there
+    are the two training cameras that it takes. All of these are of exact renders.
 
     Args:
         pipeline: in the state in which `eval_setup` leaves it.
         targets: the painting's features, for a stylised run.
         baked: whether a stylised run's baked renders are held against the exact ones as well (`baked_psnr`, in dB).
+        picture_folder: where to save the views as pictures, beside their photos; None for nowhere.
     """
-    model, views = pipeline.model, []
+    model, views, rays, seconds = pipeline.model, [], [], []
     dataset = pipeline.datamanager.eval_dataset
+    style_gram = None if targets is None else gram_matrix(targets.style_rows())
     for index in track(range(len(dataset)), description="Held-out views"):
         camera = dataset.cameras[index : index + 1].to(model.device)
         photo = dataset[index]["image"][..., :3]
-        outputs = rendered(model, camera, "exact")
+        start = time.perf_counter()
+        outputs = exact_outputs(model, camera)
+        seconds.append(time.perf_counter() - start)
+        rays.append(photo.shape[0] * photo.shape[1])
         if isinstance(model, CoarseFewShotModel):
             values = image_metrics(outputs["rgb"], photo)
             values["effective_samples"] = mean_effective_samples(model, camera)
@@ -80,40 +115,54 @@ def evaluate_held_out(
             values["content_ssim"] = image_metrics(outputs["rgb"], photo)["ssim"]
             if targets is not None:
                 accumulation = None if model.background is None else outputs["accumulation"].squeeze(-1)
-                losses = stylisation_losses(targets, outputs["rgb_coarse"], outputs["rgb"], accumulation)
-                values.update(losses)
+                values.update(
+                    stylisation_figures(targets, style_gram, outputs["rgb_coarse"], outputs["rgb"], accumulation)
+                )
             if baked:
-                values["baked_psnr"] = psnr(rendered(model, camera, "baked")["rgb"], outputs["rgb"])
+                with model.rendering("baked"):
+                    values["baked_psnr"] = psnr(model.get_outputs_for_camera(camera)["rgb"], outputs["rgb"])
+        if picture_folder is not None:
+            picture_folder.mkdir(parents=True, exist_ok=True)
+            _, pictures = model.get_image_metrics_and_images(outputs, {"image": photo})
+            for name, picture in pictures.items():
+                save_image(picture.permute(2, 0, 1).cpu(), picture_folder / f"eval_{name}_{index:04d}.png")
         views.append(values)
     means = {key: sum(view[key] for view in views) / len(views) for key in views[0]}
-    return HeldOutReport(means, views)
+    training_cameras = pipeline.datamanager.train_dataset.cameras
+    if isinstance(model, HierStyleModel) and len(training_cameras) > 1:
+        means.update(render_path(model, measuring_path(training_cameras)).figures())
+    return HeldOutReport(means, views, rays, seconds)
 
 
-def rendered(model: Model, camera: Cameras, mode: RenderMode) -> Dict[str, Tensor]:
-    """A camera's outputs in a render mode, whatever the model's own is; a coarse run has one."""
+def exact_outputs(model: Any, camera: Any) -> Dict[str, Tensor]:
+    """A camera's outputs, of a stylised run in exact rendering whatever its own mode is; a coarse run has no other."""
     if isinstance(model, CoarseFewShotModel):
         return model.get_outputs_for_camera(camera)
-    before, model.render_mode.value = model.render_mode.value, mode
-    try:
+    with model.rendering("exact"):
         return model.get_outputs_for_camera(camera)
-    finally:
-        model.render_mode.value = before
 
 
-def stylisation_losses(
+def stylisation_figures(
     targets: StyleTargets,
+    style_gram: Float[Tensor, "768 768"],
     coarse: Float[Tensor, "H W 3"],
     stylised: Float[Tensor, "H W 3"],
     accumulation: Optional[Float[Tensor, "H W"]],
 ) -> Dict[str, float]:
-    """Style loss of a view before and after stylising, and the content loss against the view before.
+    """How strong the style of a view is, before and after stylising, and how far its content has moved.
 
-    With `accumulation`, only where the scene covers the picture: a background can't be stylised.
+    `style_loss` is the nearest neighbour feature matching of Eq. 5 and `gram_distance` that of `style_strength`, each
+    with its value for the unstylised view as `…_before`; `content_loss` is the distance of features (Eq. 5) from the
+    unstylised view. With `accumulation`, only where the scene covers the picture: a background can't be stylised.
     """
     content = targets.features(coarse)
-    before, _ = targets.losses(coarse, content, accumulation)
-    after, moved = targets.losses(stylised, content, accumulation)
-    return {"style_loss_before": float(before), "style_loss": float(after), "content_loss": float(moved)}
+    values = {}
+    for suffix, picture in (("_before", coarse), ("", stylised)):
+        style, moved = targets.losses(picture, content, accumulation)
+        gram = gram_matrix(covered_rows(targets.features(picture), accumulation))
+        values[f"style_loss{suffix}"] = float(style)
+        values[f"gram_distance{suffix}"] = float(gram_distance(gram, style_gram))
+    return {**values, "content_loss": float(moved)}
 
 
 @torch.no_grad()
@@ -148,12 +197,8 @@ def evaluate_run(
         InputError: the run has no checkpoint.
     """
     config, pipeline, step = load_run(config_path)
-    targets = None
-    settings = config.pipeline
-    if isinstance(settings, HierStylePipelineConfig):
-        settings.style_image = style_image or settings.style_image
-        if settings.style_image is not None and settings.style_image.is_file():
-            targets = settings.load_targets(pipeline.device)
-    report = evaluate_held_out(pipeline, targets, baked)
+    if isinstance(config.pipeline, HierStylePipelineConfig):
+        config.pipeline.style_image = style_image or config.pipeline.style_image
+    report = evaluate_held_out(pipeline, pipeline.painting(), baked)
     report.save(output_path, config.experiment_name, config.method_name, step)
     return report

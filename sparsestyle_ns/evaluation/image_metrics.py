@@ -1,14 +1,30 @@
-"""How like a photo a picture is: PSNR, SSIM, and LPIPS where its weights are on the machine."""
+"""How like a photo a picture is: PSNR, SSIM, LPIPS where its weights are on the machine, and ST-LPIPS.
+
+ST-LPIPS (Ghildyal and Liu 2022) is LPIPS with a network that isn't moved by tiny shifts. Its AlexNet and the linear
+heads come with the package stlpips-pytorch, of which only the weight file is read. Its numbers are not LPIPS's.
+"""
 
 import functools
+import importlib.util
 from pathlib import Path
-from typing import Callable, Dict, Optional
+from typing import Callable, Dict, List, Optional, Tuple
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 ALEXNET_FILE = "alexnet-owt-7be5be79.pth"
+SHIFT_TOLERANT_LAYERS = (
+    ("net.slice1.0", "net.slice1.1"),
+    ("net.slice2.5", "net.slice2.4"),
+    ("net.slice3.9", "net.slice3.8"),
+    ("net.slice4.11", None),
+    ("net.slice5.13", None),
+)
+"""Each layer's convolution and blur in the weight file."""
+MIN_SHIFT_TOLERANT_SIDE = 24
+"""Pixels a side below which nothing is left of a picture for ST-LPIPS' last layers."""
 
 
 def psnr(image: Float[Tensor, "H W 3"], reference: Float[Tensor, "H W 3"]) -> float:
@@ -29,8 +45,64 @@ def lpips_metric() -> Optional[Callable[[Tensor, Tensor], Tensor]]:
     return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
 
 
+class ShiftTolerantLPIPS:
+    """ST-LPIPS with AlexNet: the distance of two pictures in the features of five layers.
+
+    Each layer's feature vectors are scaled to length 1; their squared differences, weighted by channel, are averaged
+    over the picture and summed over the layers (Zhang et al. 2018, Eq. 1).
+
+    Args:
+        state: the weight file's content.
+    """
+
+    def __init__(self, state: Dict[str, Tensor]) -> None:
+        self.state = state
+
+    def features(self, pictures: Float[Tensor, "B 3 H W"]) -> List[Float[Tensor, "B C h w"]]:
+        """Feature maps of pictures in [0, 1], each layer's vectors of length 1."""
+        state, maps = self.state, []
+        hidden = (2.0 * pictures - 1.0 - state["scaling_layer.shift"]) / state["scaling_layer.scale"]
+        for index, (convolution, blur) in enumerate(SHIFT_TOLERANT_LAYERS):
+            weight, bias = state[f"{convolution}.weight"], state[f"{convolution}.bias"]
+            if index == 0:
+                hidden = F.relu(self._blur(F.conv2d(hidden, weight, bias, padding=2), blur))
+            else:
+                if blur is not None:
+                    hidden = self._blur(F.max_pool2d(hidden, kernel_size=3, stride=1), blur)
+                hidden = F.relu(F.conv2d(hidden, weight, bias, padding=weight.shape[-1] // 2))
+            maps.append(hidden / (hidden.norm(dim=1, keepdim=True) + 1e-10))
+        return maps
+
+    def _blur(self, maps: Tensor, name: str) -> Tensor:
+        return F.conv2d(
+            F.pad(maps, (2, 2, 2, 2), mode="reflect"), self.state[f"{name}.filt"], stride=2, groups=maps.shape[1]
+        )
+
+    @torch.no_grad()
+    def __call__(self, first: Float[Tensor, "B 3 H W"], second: Float[Tensor, "B 3 H W"]) -> Float[Tensor, ""]:
+        """The distance of pictures in [0, 1], at least `MIN_SHIFT_TOLERANT_SIDE` pixels a side; 0 for equal ones."""
+        distance = first.new_zeros(())
+        for index, (a, b) in enumerate(zip(self.features(first), self.features(second), strict=True)):
+            distance += F.conv2d((a - b).square(), self.state[f"lin{index}.model.1.weight"]).mean()
+        return distance
+
+
+@functools.cache
+def _load_st_lpips() -> Optional[ShiftTolerantLPIPS]:
+    package = importlib.util.find_spec("stlpips_pytorch")
+    if package is None or not package.submodule_search_locations:
+        return None
+    path = Path(package.submodule_search_locations[0]) / "weights" / "vST0.0" / "alex_shift_tolerant.pth"
+    return ShiftTolerantLPIPS(torch.load(path, map_location="cpu", weights_only=True)) if path.is_file() else None
+
+
+def st_lpips_metric(size: Tuple[int, ...]) -> Optional[ShiftTolerantLPIPS]:
+    """ST-LPIPS for pictures of a height and width, on the CPU; None where its weights are gone or these too small."""
+    return _load_st_lpips() if min(size) >= MIN_SHIFT_TOLERANT_SIDE else None
+
+
 def image_metrics(image: Float[Tensor, "H W 3"], photo: Float[Tensor, "H W 3"]) -> Dict[str, float]:
-    """`psnr` in dB, `ssim`, and `lpips` where `lpips_metric` has it, of images in [0, 1]."""
+    """`psnr` in dB, `ssim`, and `lpips` and `st_lpips` where there are weights for them, of images in [0, 1]."""
     from torchmetrics.functional import structural_similarity_index_measure
 
     image, photo = image.detach().clamp(0.0, 1.0).cpu(), photo.cpu()
@@ -39,7 +111,7 @@ def image_metrics(image: Float[Tensor, "H W 3"], photo: Float[Tensor, "H W 3"]) 
         "psnr": psnr(image, photo),
         "ssim": float(structural_similarity_index_measure(batch, reference, data_range=1.0)),
     }
-    lpips = lpips_metric()
-    if lpips is not None:
-        metrics["lpips"] = float(lpips(batch, reference))
+    for name, metric in (("lpips", lpips_metric()), ("st_lpips", st_lpips_metric(photo.shape[:2]))):
+        if metric is not None:
+            metrics[name] = float(metric(batch, reference))
     return metrics

@@ -7,7 +7,8 @@ from jaxtyping import Float
 from nerfstudio.field_components.mlp import MLP
 from torch import Tensor, nn
 
-from sparsestyle_ns.field_components.hash_grid import GridLocation, HashGrid
+from sparsestyle_ns.field_components.hash_grid import GridLocation
+from sparsestyle_ns.field_components.point_encodings import PointEncoding
 from sparsestyle_ns.fields.pieces import in_pieces
 
 
@@ -41,7 +42,7 @@ class ResidualField(nn.Module):
     At the start σ' is 0 everywhere, so that stylising begins from the coarse geometry, and c_f is grey.
 
     Args:
-        grid: ψ.
+        grid: ψ, or an encoding in its place.
         feature_dim: length of e_c.
         hidden_layers: of the MLP; the paper has 2.
         layer_width: units in each; the paper has 256.
@@ -52,7 +53,7 @@ class ResidualField(nn.Module):
 
     def __init__(
         self,
-        grid: HashGrid,
+        grid: PointEncoding,
         feature_dim: int,
         hidden_layers: int = 2,
         layer_width: int = 256,
@@ -76,7 +77,7 @@ class ResidualField(nn.Module):
             nn.init.zeros_(self.density_head.bias)
 
     def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
-        """Where field coordinates in [−1, 1]³ lie in the hash grid."""
+        """Where field coordinates in [−1, 1]³ lie in the encoding's cube."""
         return self.grid.locate(0.5 * (positions + 1.0))
 
     def forward(

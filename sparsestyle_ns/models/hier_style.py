@@ -1,7 +1,8 @@
 """`hier-style`: the coarse field, frozen, and the residual field that stylises it (stage 2)."""
 
+import contextlib
 from dataclasses import dataclass, field
-from typing import Any, Dict, List, Literal, Optional, Tuple, Type
+from typing import Any, Dict, Iterator, List, Literal, Optional, Tuple, Type
 
 import torch
 from jaxtyping import Float
@@ -14,6 +15,8 @@ from torch.nn import Parameter
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.field_components.hash_grid import HashGrid
+from sparsestyle_ns.field_components.point_encodings import FrequencyEncoding, NoEncoding, PointEncoding
+from sparsestyle_ns.fields.fine_tuned import FineTunedField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
 from sparsestyle_ns.rendering.baked import BakedVolume, Rays, render_baked
@@ -47,6 +50,14 @@ class HierStyleModelConfig(ModelConfig):
     """Unused: the space of the scene decides where rays start and end."""
     coarse_field: CoarseFieldConfig = field(default_factory=CoarseFieldConfig)
     """The coarse field; taken over from the coarse run."""
+    stylised_field: Literal["residual", "coarse"] = "residual"
+    """What is stylised: the residual field on the frozen coarse one (Eq. 2 and 3), or a copy of the coarse field
+    itself, fine-tuned as ARF does; then the settings of the residual field mean nothing."""
+    fine_encoding: Literal["hash", "frequency", "none"] = "hash"
+    """What the residual field sees of a position beside e_c: the hash grid ψ(x), sines and cosines of
+    `frequency_levels` octaves, or nothing."""
+    frequency_levels: int = 10
+    """Octaves of the sines and cosines, where they take the hash grid's place."""
     hash_levels: int = 8
     """Levels of the hash grid (M)."""
     min_resolution: int = 128
@@ -98,21 +109,8 @@ class HierStyleModel(Model):
         config = self.config
         self.space = effects.build_space(scene_box=self.scene_box, metadata=metadata)
         self.field = config.coarse_field.setup(effects).requires_grad_(False)
-        grid = HashGrid(
-            config.hash_levels,
-            config.min_resolution,
-            config.max_resolution,
-            config.features_per_level,
-            config.log2_table_size,
-        )
-        self.residual = ResidualField(
-            grid,
-            config.coarse_field.feature_dim,
-            config.hidden_layers,
-            config.layer_width,
-            config.residual_density_scale,
-            effects.on("residual_density"),
-        )
+        residual = config.stylised_field == "residual"
+        self.residual = self._residual_field(effects) if residual else self._fine_tuned_field(effects)
         self.occupancy = effects.build("empty_space", grid=Occupancy, resolution=config.occupancy_resolution)
         self.exposure = effects.build("exposure", num_photos=self.num_train_data)
         if self.exposure is not None:
@@ -123,8 +121,36 @@ class HierStyleModel(Model):
         )
         self._baked: Optional[Tuple[BakedVolume, List[Tensor]]] = None
 
+    def _residual_field(self, effects: Decisions) -> ResidualField:
+        config = self.config
+        return ResidualField(
+            self._fine_encoding(),
+            config.coarse_field.feature_dim,
+            config.hidden_layers,
+            config.layer_width,
+            config.residual_density_scale,
+            effects.on("residual_density"),
+        )
+
+    def _fine_encoding(self) -> PointEncoding:
+        config = self.config
+        if config.fine_encoding == "none":
+            return NoEncoding()
+        if config.fine_encoding == "frequency":
+            return FrequencyEncoding(config.frequency_levels)
+        return HashGrid(
+            config.hash_levels,
+            config.min_resolution,
+            config.max_resolution,
+            config.features_per_level,
+            config.log2_table_size,
+        )
+
+    def _fine_tuned_field(self, effects: Decisions) -> FineTunedField:
+        return FineTunedField(self.config.coarse_field.setup(effects))
+
     def get_param_groups(self) -> Dict[str, List[Parameter]]:
-        """One group, `fields`: the residual field. The coarse field is frozen."""
+        """One group, `fields`: the field that is stylised. The coarse field is frozen."""
         return {"fields": list(self.residual.parameters())}
 
     @torch.no_grad()
@@ -140,6 +166,8 @@ class HierStyleModel(Model):
             part = {key[len(name) + 1 :]: value for key, value in state.items() if key.startswith(name + ".")}
             getattr(self, name).load_state_dict(part, strict=True)
         self.field.to(self.device)
+        if isinstance(self.residual, FineTunedField):
+            self.residual.field.load_state_dict(self.field.state_dict())
         if self.occupancy is None:
             return
         with autocast(self.device, self.config.precision):
@@ -233,7 +261,7 @@ class HierStyleModel(Model):
         return render_baked(self._current_volume(), rays, self.background)
 
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
-        """`rgb` (stylised), `rgb_coarse`, `accumulation`, and `depth` of the stylised geometry in world units."""
+        """`rgb` (stylised), `accumulation`, `depth` in world units, and the same of the coarse field as `…_coarse`."""
         segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
         if self.render_mode.value == "baked" and not self.training:
             fine, coarse = self._render_baked(segments)
@@ -245,7 +273,18 @@ class HierStyleModel(Model):
             "rgb_coarse": coarse.rgb,
             "accumulation": fine.accumulation,
             "depth": segments.distance(fine.s.clamp(max=1.0 - 1e-4)),
+            "accumulation_coarse": coarse.accumulation,
+            "depth_coarse": segments.distance(coarse.s.clamp(max=1.0 - 1e-4)),
         }
+
+    @contextlib.contextmanager
+    def rendering(self, mode: RenderMode) -> Iterator[None]:
+        """Within it, pictures are made in this mode, whatever the model's own is."""
+        before, self.render_mode.value = self.render_mode.value, mode
+        try:
+            yield
+        finally:
+            self.render_mode.value = before
 
     def get_loss_dict(
         self, outputs: Dict[str, Tensor], batch: Dict[str, Any], metrics_dict: Optional[Dict[str, Tensor]] = None

@@ -1,6 +1,7 @@
 """What the pipelines of both methods have in common."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Dict, Literal, Optional
 
 import tyro
@@ -15,6 +16,7 @@ from sparsestyle_ns.effects.panel import EffectsPanel
 from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings
 from sparsestyle_ns.errors import InputError, exit_on_input_error
 from sparsestyle_ns.ffmpeg import put_ffmpeg_on_path
+from sparsestyle_ns.style.targets import StyleTargets
 
 TestMode = Literal["test", "val", "inference"]
 
@@ -65,6 +67,22 @@ class CheckedPipeline(VanillaPipeline):
         """What is simulated, and why."""
         assert self.config.decided is not None
         return self.config.decided
+
+    def painting(self) -> Optional[StyleTargets]:
+        """The painting to measure against, where the method has one and it is still there."""
+        return None
+
+    @exit_on_input_error
+    def get_average_eval_image_metrics(
+        self, step: Optional[int] = None, output_path: Optional[Path] = None, get_std: bool = False
+    ) -> Dict[str, float]:
+        """The figures of `sparsestyle evaluate`, for `ns-eval`, with the time that rendering took."""
+        from sparsestyle_ns.evaluation.held_out import evaluate_held_out
+
+        self.eval()
+        report = evaluate_held_out(self, self.painting(), picture_folder=output_path)
+        self.train()
+        return {**report.means, **(report.deviations() if get_std else {}), **report.speed()}
 
     @exit_on_input_error
     def load_pipeline(self, loaded_state: Dict[str, Any], step: int) -> None:

@@ -31,9 +31,6 @@ from sparsestyle_ns.style.image import load_style_image
 from sparsestyle_ns.style.targets import StyleTargets
 from sparsestyle_ns.style.vgg import load_backbone
 
-WARM_START_LEARNING_RATE = 5e-3
-"""That of the iterations that follow."""
-
 
 @dataclass
 class HierStylePipelineConfig(CheckedPipelineConfig):
@@ -133,8 +130,14 @@ class HierStylePipeline(CheckedPipeline):
         self.prepare_style()
         self.prepare_views()
         if trainer is not None and trainer._start_step == 0 and self.config.warm_start_steps > 0:
-            self.warm_start()
+            self.warm_start(training_callback_attributes.optimizers.optimizers["fields"].param_groups[0]["lr"])
         return super().get_training_callbacks(training_callback_attributes)
+
+    def painting(self) -> Optional[StyleTargets]:
+        """See `CheckedPipeline.painting`."""
+        if self.targets is None and self.config.style_image is not None and self.config.style_image.is_file():
+            return self.config.load_targets(self.device)
+        return self.targets
 
     def prepare_style(self) -> None:
         """Loads the painting and the feature network."""
@@ -251,18 +254,24 @@ class HierStylePipeline(CheckedPipeline):
             for picture, changed, weight in zip(pictures, transferred, weights, strict=True)
         ]
 
-    def warm_start(self) -> None:
+    def warm_start(self, learning_rate: float) -> None:
         """Fits c_f, on the coarse geometry, to the content pictures of the photos.
+
+        A coarse field that is fine-tuned itself is fitted as a whole: its colours can't change with its geometry held.
 
         The features of VGG's third block hardly see colour; stylising from grey loses the palette. The paper doesn't do
         this.
+
+        Args:
+            learning_rate: Adam's; that of the iterations that follow.
         """
         photos = self.views[: len(self.datamanager.pixels.sizes)]
+        coarse_geometry = self.model.config.stylised_field == "residual"
         parameters = list(self.model.residual.parameters())
-        optimizer = torch.optim.Adam(parameters, lr=WARM_START_LEARNING_RATE, fused=True)
+        optimizer = torch.optim.Adam(parameters, lr=learning_rate, fused=True)
         for step in track(range(self.config.warm_start_steps), description="Warm start", transient=True):
             view = photos[step % len(photos)]
-            loss = reconstruction_loss(self._render(view, coarse_geometry=True), view.picture)
+            loss = reconstruction_loss(self._render(view, coarse_geometry), view.picture)
             optimizer.zero_grad()
             loss.backward()
             average_gradients(parameters)

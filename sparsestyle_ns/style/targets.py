@@ -39,6 +39,17 @@ def sample_rows(rows: Float[Tensor, "rows C"], count: int) -> Float[Tensor, "kep
     return rows[drawn.sort().values.to(rows.device)]
 
 
+def covered_rows(
+    features: Float[Tensor, "1 C h w"], accumulation: Optional[Float[Tensor, "H W"]]
+) -> Float[Tensor, "rows C"]:
+    """Those of a feature map's vectors that show the scene; all where no pixel does, or without `accumulation`."""
+    rows = feature_rows(features)
+    if accumulation is None:
+        return rows
+    covered = F.interpolate(accumulation[None, None].float(), size=features.shape[-2:], mode="area").flatten() > 0.5
+    return rows[covered] if covered.any() else rows
+
+
 class StyleTargets:
     """Style and content losses of an image against fixed targets (the two terms of Eq. 5).
 
@@ -62,14 +73,20 @@ class StyleTargets:
     ) -> None:
         self.backbone = backbone
         self.feature_side = feature_side
+        self.style_side = style_side
         self.style_image = style_image
         with torch.no_grad():
-            rows = feature_rows(backbone(fit_side(style_image[None], style_side)))
+            rows = self.style_rows()
             self.style = StyleIndex(rows if style_features is None else sample_rows(rows, style_features))
 
     def features(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 768 h w"]:
         """The network's view of a picture."""
         return self.backbone(fit_side(image.permute(2, 0, 1)[None], self.feature_side))
+
+    @torch.no_grad()
+    def style_rows(self) -> Float[Tensor, "rows 768"]:
+        """The style image's feature vectors, as the network gives them; the index keeps their directions alone."""
+        return feature_rows(self.backbone(fit_side(self.style_image[None], self.style_side)))
 
     def losses(
         self,
@@ -85,11 +102,5 @@ class StyleTargets:
             accumulation: how opaque the scene is in each pixel. Where it is less than half, the picture shows a
                 background that nothing can stylise, and its features don't count. None: all count.
         """
-        features, target = feature_rows(self.features(image)), feature_rows(content)
-        if accumulation is not None:
-            covered = (
-                F.interpolate(accumulation[None, None].float(), size=content.shape[-2:], mode="area").flatten() > 0.5
-            )
-            if covered.any():
-                features, target = features[covered], target[covered]
+        features, target = (covered_rows(maps, accumulation) for maps in (self.features(image), content))
         return nnfm_loss(features, self.style), content_loss(features, target)

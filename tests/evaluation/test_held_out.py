@@ -1,8 +1,13 @@
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
+import pytest
+from conftest import run_entrypoint
+
 from sparsestyle_ns.evaluation.held_out import evaluate_run
+from sparsestyle_ns.evaluation.tables import report_tables
 from sparsestyle_ns.run_folder import find_config
 
 
@@ -17,3 +22,53 @@ def test_baked_renders_are_held_against_exact_ones_when_asked_for(runs: SimpleNa
 
 def test_a_coarse_run_has_nothing_to_bake(runs: SimpleNamespace, tmp_path: Path) -> None:
     assert "baked_psnr" not in evaluate_run(find_config(runs.coarse), tmp_path / "coarse.json", baked=True).means
+
+
+def test_a_stylised_run_is_measured_for_truth_consistency_style_and_content(runs: SimpleNamespace) -> None:
+    means = evaluate_run(find_config(runs.style), runs.outputs / "evaluation.json").means
+    for key in ("coarse_psnr", "coarse_ssim", "coarse_st_lpips", "content_ssim", "content_loss"):
+        assert key in means
+    for key in ("style_loss", "style_loss_before", "gram_distance", "gram_distance_before"):
+        assert means[key] > 0
+    for part in ("short", "long"):
+        assert 0 < means[f"{part}_visible"] <= 1
+        for kind in ("rmse", "ssim", "st_lpips"):
+            assert f"{part}_{kind}" in means and f"ceiling_{part}_{kind}" in means
+    assert means["short_visible"] >= means["long_visible"]
+    assert means["ceiling_short_rmse"] <= means["ceiling_long_rmse"]
+
+
+def test_ns_eval_gives_the_same_figures(runs: SimpleNamespace, tmp_path: Path) -> None:
+    from nerfstudio.scripts import eval as ns_eval
+
+    for run in (runs.coarse, runs.style):
+        output = tmp_path / f"{run.parent.name}.json"
+        run_entrypoint(ns_eval.entrypoint, ["--load-config", str(run / "config.yml"), "--output-path", str(output)])
+        found = json.loads(output.read_text())["results"]
+        expected = evaluate_run(find_config(run), tmp_path / "ours.json").means
+        assert expected == pytest.approx({key: found[key] for key in expected})
+        assert found["fps"] > 0 and found["num_rays_per_sec"] > 0
+        assert all(f"{key}_std" in found for key in ("psnr", "ssim") if key in found)
+
+
+def test_a_run_whose_painting_is_gone_is_measured_without_the_style(runs: SimpleNamespace, tmp_path: Path) -> None:
+    text = (runs.style / "config.yml").read_text()
+    moved = tmp_path / "scene" / "hier-style" / "run"
+    shutil.copytree(runs.style, moved)
+    (moved / "config.yml").write_text(text.replace("painting.png", "gone.png"))
+    means = evaluate_run(find_config(moved), tmp_path / "report.json").means
+    assert "style_loss" not in means and "gram_distance" not in means
+    assert "short_rmse" in means and "coarse_psnr" in means
+
+
+def test_the_tables_show_each_figure_and_say_what_is_missing(capsys: pytest.CaptureFixture) -> None:
+    means = {"coarse_psnr": 20.5, "content_ssim": 0.5, "style_loss": 0.1, "style_loss_before": 0.2}
+    means |= {"short_rmse": 0.04, "ceiling_short_rmse": 0.03, "short_visible": 0.9}
+    quality, style, consistency = report_tables(means, 3)
+    assert (quality.columns, quality.rows) == (["PSNR dB ↑"], [("coarse", ["20.50"])])
+    assert style.rows == [("unstylised", ["0.2000", None]), ("stylised", ["0.1000", "0.500"])]
+    assert "ArtFID" in style.note
+    assert consistency.rows == [("stylised", ["0.040", "0.900"]), ("unstylised (the ceiling)", ["0.030", None])]
+    consistency.print()
+    assert "short RMSE ↓" in capsys.readouterr().out
+    assert len(report_tables({"psnr": 20.0}, 1)) == 1

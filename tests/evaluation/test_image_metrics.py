@@ -4,7 +4,13 @@ import pytest
 import torch
 
 from sparsestyle_ns.evaluation import image_metrics as module
-from sparsestyle_ns.evaluation.image_metrics import ALEXNET_FILE, image_metrics, lpips_metric, psnr
+from sparsestyle_ns.evaluation.image_metrics import (
+    ALEXNET_FILE,
+    image_metrics,
+    lpips_metric,
+    psnr,
+    st_lpips_metric,
+)
 
 
 @pytest.fixture
@@ -15,6 +21,7 @@ def photo():
 @pytest.fixture
 def without_lpips(monkeypatch):
     monkeypatch.setattr(module, "lpips_metric", lambda: None)
+    monkeypatch.setattr(module, "st_lpips_metric", lambda size: None)
 
 
 @pytest.mark.parametrize("error, decibels", [(1.0, 0), (0.1, 20), (0.01, 40)])
@@ -78,7 +85,21 @@ def test_without_its_weights_lpips_is_left_out_and_nothing_is_downloaded(photo, 
     lpips_metric.cache_clear()
     try:
         assert lpips_metric() is None
-        assert image_metrics(photo, photo).keys() == {"psnr", "ssim"}
+        assert image_metrics(photo, photo).keys() == {"psnr", "ssim", "st_lpips"}
     finally:
         lpips_metric.cache_clear()
     assert ALEXNET_FILE.startswith("alexnet")
+
+
+def test_st_lpips_is_what_its_authors_code_gives():
+    # By stlpips_pytorch.stlpips.LPIPS(net="alex", variant="shift_tolerant") 0.0.2 with normalize=True.
+    generator = torch.Generator().manual_seed(0)
+    for size, expected in (((24, 32), 0.0037791768), ((40, 64), 0.0027447660), ((94, 126), 0.0021828124)):
+        first = torch.rand(1, 3, *size, generator=generator)
+        second = (first + 0.2 * torch.rand(1, 3, *size, generator=generator)).clamp(0, 1)
+        assert float(st_lpips_metric(size)(first, second)) == pytest.approx(expected, rel=1e-4)
+
+
+def test_pictures_too_small_for_st_lpips_go_without():
+    assert st_lpips_metric((23, 500)) is None
+    assert st_lpips_metric((24, 24))(torch.rand(1, 3, 24, 24), torch.rand(1, 3, 24, 24)) > 0

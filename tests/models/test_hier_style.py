@@ -18,7 +18,17 @@ SPARE = ("box", "background", "empty_space", "residual_density")
 
 
 def make_model(effects=SPARE, **settings):
-    torch.manual_seed(0)
+    model = make_untrained(effects, **settings)
+    with torch.no_grad():
+        model.residual.grid.table.uniform_(-1, 1)
+        if model.residual.density_head is not None:
+            torch.nn.init.normal_(model.residual.density_head.weight, std=0.1)
+        torch.nn.init.normal_(model.residual.color_head.weight)
+    return model
+
+
+def make_untrained(effects=SPARE, seed=0, **settings):
+    torch.manual_seed(seed)
     config = HierStyleModelConfig(
         coarse_field=CoarseFieldConfig(
             num_levels=3,
@@ -39,13 +49,7 @@ def make_model(effects=SPARE, **settings):
         **settings,
     )
     metadata = {"effects": decided(*effects, background={"color": [1.0, 0.5, 0.0]})}
-    model = config.setup(scene_box=BOX, num_train_data=1, metadata=metadata).eval()
-    with torch.no_grad():
-        model.residual.grid.table.uniform_(-1, 1)
-        if model.residual.density_head is not None:
-            torch.nn.init.normal_(model.residual.density_head.weight, std=0.1)
-        torch.nn.init.normal_(model.residual.color_head.weight)
-    return model
+    return config.setup(scene_box=BOX, num_train_data=1, metadata=metadata).eval()
 
 
 @pytest.fixture
@@ -64,7 +68,8 @@ def render(model, mode=None):
 
 
 def assert_close(found, expected, tolerance=0.02):
-    assert found.keys() == expected.keys() == {"rgb", "rgb_coarse", "accumulation", "depth"}
+    names = {"rgb", "accumulation", "depth"}
+    assert found.keys() == expected.keys() == names | {f"{name}_coarse" for name in names}
     for key, value in expected.items():
         assert found[key].shape == value.shape
         torch.testing.assert_close(found[key], value, atol=tolerance, rtol=0, msg=key)
@@ -154,3 +159,37 @@ def test_a_coarse_colour_that_depends_on_the_direction_is_baked_as_its_mean_and_
 
 def test_the_viewers_control_begins_with_the_configs_mode_and_offers_both(model):
     assert (model.render_mode.value, model.render_mode.options) == ("baked", ["exact", "baked"])
+
+
+def test_a_coarse_field_that_is_fine_tuned_starts_as_it_is_and_alone_learns():
+    model = make_untrained(stylised_field="coarse")
+    model.adopt_coarse(make_untrained(seed=1).state_dict())
+    before = render(model, "exact")
+    torch.testing.assert_close(before["rgb"], before["rgb_coarse"])
+    torch.testing.assert_close(before["depth"], before["depth_coarse"])
+    parameters = model.get_param_groups()["fields"]
+    assert sum(p.numel() for p in parameters) == sum(p.numel() for p in model.field.parameters())
+    model.train()
+    optimizer = torch.optim.Adam(parameters, lr=0.01)
+    frozen = model.freeze(torch.tensor([[-3.0, 0.1, 0.2]]), torch.tensor([[1.0, 0.0, 0.0]]))
+    model.stylised(frozen).rgb.sum().backward()
+    optimizer.step()
+    after = render(model.eval(), "exact")
+    assert (after["rgb"] - before["rgb"]).abs().max() > 1e-3
+    assert (after["accumulation"] - before["accumulation"]).abs().max() > 1e-4
+    torch.testing.assert_close(after["rgb_coarse"], before["rgb_coarse"], atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("encoding, numbers", [("hash", 8), ("frequency", 3 + 6 * 5), ("none", 0)])
+def test_the_residual_field_sees_what_the_config_says_beside_the_coarse_feature(encoding, numbers):
+    model = make_untrained(fine_encoding=encoding, frequency_levels=5)
+    assert model.residual.mlp.layers[0].in_features == numbers + 4
+    assert any("table" in name for name in model.state_dict()) == (encoding == "hash")
+    assert render(model, "exact")["rgb"].isfinite().all()
+
+
+def test_a_picture_in_one_mode_leaves_the_models_own_as_it_was(model):
+    with pytest.raises(RuntimeError), model.rendering("exact"):
+        assert model.render_mode.value == "exact"
+        raise RuntimeError
+    assert model.render_mode.value == "baked"

@@ -1,0 +1,79 @@
+"""The one path of cameras on which consistency is measured: fixed by the training cameras, without chance or choice."""
+
+import itertools
+import math
+from typing import List
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.camera_utils import get_interpolated_poses
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from sparsestyle_ns.errors import InputError
+
+NUM_FRAMES = 24
+"""Frames of the path, at least."""
+ARC_STEP = math.radians(2.0)
+"""Angle between neighbouring frames of an arc."""
+FACING = math.cos(math.radians(60.0))
+"""Cameras all of whose view directions are at least this close (cosine) to their mean look one way."""
+
+
+def measuring_path(cameras: Cameras) -> Cameras:
+    """The path's cameras, one a frame, with the first training camera's lens, undistorted.
+
+    Where the training cameras look one way, the path leads from each to the next in their order, in steps of equal
+    parts; where they stand all around, it is an arc around the point that they look at, level with them on average,
+    in steps of 2° from the first one's side on.
+
+    Args:
+        cameras: the training cameras, two or more.
+
+    Raises:
+        InputError: there are fewer than two.
+    """
+    if len(cameras) < 2:
+        raise InputError("Consistency is measured between training views, and there is one; train on two or more.")
+    poses = cameras.camera_to_worlds.cpu().float()
+    forward = -poses[:, :, 2]
+    mean = torch.nn.functional.normalize(forward.mean(dim=0), dim=0)
+    path = poses_between(poses) if bool((forward @ mean > FACING).all()) else poses_around(poses)
+    count = len(path)
+    return Cameras(
+        camera_to_worlds=path.to(cameras.camera_to_worlds),
+        **{name: getattr(cameras, name)[:1].expand(count, 1) for name in ("fx", "fy", "cx", "cy", "width", "height")},
+    )
+
+
+def poses_between(poses: Float[Tensor, "cameras 3 4"]) -> Float[Tensor, "frames 3 4"]:
+    """Poses from each camera to the next; equally many, `NUM_FRAMES` at least in all, in each gap."""
+    steps = -(-(NUM_FRAMES - 1) // (len(poses) - 1))
+    path: List[Tensor] = [poses[0]]
+    for first, second in itertools.pairwise(poses):
+        between = get_interpolated_poses(first.numpy(), second.numpy(), steps + 1)
+        path += [torch.tensor(pose[:3], dtype=poses.dtype) for pose in between[1:]]
+    return torch.stack(path)
+
+
+def poses_around(poses: Float[Tensor, "cameras 3 4"]) -> Float[Tensor, "frames 3 4"]:
+    """An arc of `NUM_FRAMES` poses around the point closest to all optical axes, with z up."""
+    center = axes_meet(poses)
+    offsets = poses[:, :, 3] - center
+    height = offsets[:, 2].mean()
+    radius = offsets[:, :2].norm(dim=-1).mean()
+    start = torch.atan2(offsets[0, 1], offsets[0, 0])
+    angles = start + ARC_STEP * torch.arange(NUM_FRAMES, dtype=poses.dtype)
+    positions = center + torch.stack(
+        [radius * torch.cos(angles), radius * torch.sin(angles), height.expand(NUM_FRAMES)], dim=-1
+    )
+    back = torch.nn.functional.normalize(positions - center, dim=-1)
+    right = torch.nn.functional.normalize(torch.linalg.cross(back.new_tensor([[0.0, 0.0, 1.0]]), back), dim=-1)
+    return torch.stack([right, torch.linalg.cross(back, right), back, positions], dim=-1)
+
+
+def axes_meet(poses: Float[Tensor, "cameras 3 4"]) -> Float[Tensor, "3"]:
+    """The point with the smallest sum of squared distances to the cameras' optical axes."""
+    axes = poses[:, :, 2]
+    across = torch.eye(3, dtype=poses.dtype) - axes[:, :, None] * axes[:, None, :]
+    return torch.linalg.lstsq(across.sum(dim=0), (across @ poses[:, :, 3:]).sum(dim=0)).solution[:, 0]

@@ -1,0 +1,108 @@
+"""Figures set out in tables, on a terminal and for a page."""
+
+from dataclasses import dataclass, field
+from typing import Dict, List, Optional, Sequence, Tuple
+
+from rich.console import Console
+from rich.table import Table as RichTable
+
+LABELS: Dict[str, Tuple[str, int]] = {
+    "psnr": ("PSNR dB ↑", 2),
+    "ssim": ("SSIM ↑", 3),
+    "lpips": ("LPIPS ↓", 3),
+    "st_lpips": ("ST-LPIPS ↓", 4),
+    "rmse": ("RMSE ↓", 3),
+    "visible": ("pixels that count", 3),
+    "effective_samples": ("effective samples a ray ↓", 2),
+    "style_loss": ("NNFM to the style ↓", 4),
+    "gram_distance": ("Gram distance to the style ↓", 4),
+    "content_loss": ("feature distance to the content ↓", 3),
+    "content_ssim": ("SSIM to the photo ↑", 3),
+    "baked_psnr": ("baked to exact, PSNR dB ↑", 1),
+}
+"""A figure's name in words, with the direction that is better, and its decimals."""
+PERCEPTUAL = ("rmse", "ssim", "lpips", "st_lpips")
+
+
+@dataclass
+class Table:
+    """A table of figures.
+
+    Attributes:
+        title: above it.
+        columns: headings of the columns after the first.
+        rows: each row's name and cells; None is an empty one.
+        note: a sentence below it.
+        cited: names of rows whose figures are others', not measured here.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: List[Tuple[str, List[Optional[str]]]] = field(default_factory=list)
+    note: str = ""
+    cited: Tuple[str, ...] = ()
+
+    def print(self) -> None:
+        """Prints it."""
+        table = RichTable(title=self.title, title_justify="left", caption=self.note or None, caption_justify="left")
+        table.add_column("")
+        for column in self.columns:
+            table.add_column(column, justify="right")
+        for name, cells in self.rows:
+            table.add_row(name, *(cell or "–" for cell in cells), style="italic dim" if name in self.cited else None)
+        Console().print(table)
+
+
+def written(key: str, value: Optional[float]) -> Optional[str]:
+    """A figure as text, with the decimals of its kind; `key` may be preceded by what it is of (`short_rmse`)."""
+    if value is None:
+        return None
+    return f"{value:.{LABELS[key][1]}f}"
+
+
+def table_of(
+    title: str,
+    columns: Sequence[Tuple[str, str, str]],
+    rows: Sequence[Tuple[str, Dict[str, Optional[float]]]],
+    note: str = "",
+) -> Table:
+    """A table of some of each row's figures; columns that no row has a figure for are left out.
+
+    Args:
+        title: above it.
+        columns: of each the figure's key in a row, its kind (a key of `LABELS`), and words before the kind's label.
+        rows: of each its name and figures.
+        note: below it.
+    """
+    shown = [column for column in columns if any(figures.get(column[0]) is not None for _, figures in rows)]
+    return Table(
+        title,
+        [f"{words}{LABELS[kind][0]}" for _, kind, words in shown],
+        [(name, [written(kind, figures.get(key)) for key, kind, _ in shown]) for name, figures in rows],
+        note,
+    )
+
+
+def consistency_columns() -> List[Tuple[str, str, str]]:
+    """Columns of short- and long-range consistency."""
+    return [(f"{part}_{kind}", kind, f"{part} ") for part in ("short", "long") for kind in PERCEPTUAL]
+
+
+def report_tables(means: Dict[str, float], num_views: int) -> List[Table]:
+    """The tables of one run's figures, as `sparsestyle evaluate` prints them."""
+    views = f"{num_views} held-out view" + "s" * (num_views > 1)
+    prefix = "coarse_" if "coarse_psnr" in means else ""
+    quality = ("psnr", "ssim", "lpips", "st_lpips", "effective_samples")
+    tables = [table_of(f"Coarse field, {views}", [(f"{prefix}{k}", k, "") for k in quality], [("coarse", means)])]
+    if not prefix:
+        return tables
+    kept = [(key, key, "") for key in ("style_loss", "gram_distance", "content_loss", "content_ssim", "baked_psnr")]
+    before = {key: means.get(f"{key}_before") for key in ("style_loss", "gram_distance")}
+    missing = "ArtFID is left out: its network's weights aren't part of this package."
+    tables.append(table_of(f"Style and content, {views}", kept, [("unstylised", before), ("stylised", means)], missing))
+    if "short_rmse" in means:
+        ceiling = {key[len("ceiling_") :]: value for key, value in means.items() if key.startswith("ceiling_")}
+        columns = [*consistency_columns(), *((f"{part}_visible", "visible", f"{part} ") for part in ("short", "long"))]
+        rows = [("stylised", means), ("unstylised (the ceiling)", ceiling)]
+        tables.append(table_of("Consistency on the measuring path, frames t and t + 1, t and t + 7", columns, rows))
+    return tables

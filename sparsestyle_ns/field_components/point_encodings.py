@@ -1,0 +1,62 @@
+"""What may take the hash grid's place in the residual field: sines and cosines, or nothing (Sec. 4.2, the ablations).
+
+Both have the hash grid's two steps, `locate` and `interpolate`, though locating does nothing here.
+"""
+
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from nerfstudio.field_components.encodings import FieldComponent
+from torch import Tensor
+
+from sparsestyle_ns.field_components.hash_grid import GridLocation
+from sparsestyle_ns.field_components.positional_encoding import positional_encoding
+
+
+class PointEncoding(Protocol):
+    """What the residual field asks of an encoding."""
+
+    def get_out_dim(self) -> int:
+        """Numbers a point."""
+
+    def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
+        """What is needed of points in [0, 1]³, and stays the same while the encoding learns."""
+
+    def interpolate(self, location: GridLocation) -> Float[Tensor, "points encoded"]:
+        """The encoding of located points."""
+
+
+class FrequencyEncoding(FieldComponent):
+    """x and sin(2^k x), cos(2^k x), k = 0 … L − 1, of field coordinates; γ(x) of Eq. 1 with more octaves.
+
+    Args:
+        num_levels: L. Ten octaves have waves of 2π/512, shorter than three cells of the finest hash level.
+    """
+
+    def __init__(self, num_levels: int) -> None:
+        super().__init__(in_dim=3, out_dim=3 * (1 + 2 * num_levels))
+        self.num_levels = num_levels
+
+    def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
+        """See `PointEncoding.locate`."""
+        return GridLocation(positions, None)
+
+    def interpolate(self, location: GridLocation) -> Float[Tensor, "points encoded"]:
+        """See `PointEncoding.interpolate`."""
+        return positional_encoding(2.0 * location.positions - 1.0, self.num_levels)
+
+
+class NoEncoding(FieldComponent):
+    """No numbers at all: the residual field is left with e_c."""
+
+    def __init__(self) -> None:
+        super().__init__(in_dim=3, out_dim=0)
+
+    def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
+        """See `PointEncoding.locate`."""
+        return GridLocation(positions, None)
+
+    def interpolate(self, location: GridLocation) -> Float[Tensor, "points 0"]:
+        """See `PointEncoding.interpolate`."""
+        return torch.empty(len(location.positions), 0, device=location.positions.device)
