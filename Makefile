@@ -53,7 +53,7 @@ bench: $(READY)
 	$(BIN)/python -m benchmarks.summary $(BENCH)
 
 $(READY): pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/python -m pip install -c constraints.txt -e .[dev]
+	$(BIN)/python -m pip install -c constraints.txt -e .[dev,compare]
 	@touch $@
 
 $(BIN)/python:
