@@ -274,7 +274,7 @@ def test_samples_lie_in_occupied_cells(scene, rays, resolution, steps):
     assert (samples.lengths >= 0).all() and samples.positions.isfinite().all()
 
 
-@covers(volume.over_background, volume.mean_position, volume.composite)
+@covers(volume.over_background, volume.seen_behind, volume.mean_position, volume.composite)
 @given(st.data(), COUNTS, st.integers(1, 50))
 def test_pixels_of_weights_are_mixtures(data, num_rays, samples):
     depth = data.draw(tensors((num_rays, samples), -30, 2, dtype=torch.float32)).clamp(max=80)
@@ -284,6 +284,8 @@ def test_pixels_of_weights_are_mixtures(data, num_rays, samples):
     background = torch.rand(3, generator=torch.Generator().manual_seed(data.draw(SEEDS)))
     pixel = volume.over_background(accumulation * 0.5, accumulation, background)
     assert (pixel >= -1e-6).all() and (pixel <= 1 + 1e-6).all()
+    torch.testing.assert_close(pixel - volume.seen_behind(accumulation, background), 0.5 * accumulation.expand(-1, 3))
+    assert (volume.seen_behind(accumulation, None) == 0).all()
     mean = volume.mean_position(weights, s)
     assert (mean >= 0).all() and (mean <= 1 + 1e-5).all()
     sums = torch.cat([accumulation.expand(-1, 3) * 0.5, accumulation, (weights * s).sum(dim=-1, keepdim=True)], dim=-1)
@@ -310,6 +312,7 @@ def tiny_fields(seed, bias):
     volume.render_frozen_coarse,
     precision.autocast,
     precision.multiplies_bfloat16,
+    precision.multiplies_tf32,
 )
 @given(
     SEEDS,
@@ -317,7 +320,7 @@ def tiny_fields(seed, bias):
     unit_rays(),
     st.integers(1, 30),
     st.floats(-50, 1e9),
-    st.sampled_from(["float32", "bfloat16", "auto"]),
+    st.sampled_from(["float32", "tf32", "bfloat16", "auto"]),
 )
 def test_renders_of_any_field_are_pictures(seed, scene, rays, steps, bias, number_format):
     layout, scale = scene
@@ -326,6 +329,7 @@ def test_renders_of_any_field_are_pictures(seed, scene, rays, steps, bias, numbe
     segments = layout.segments(origins, directions)
     background = torch.rand(3)
     assert precision.multiplies_bfloat16(origins.device) in (True, False)
+    assert not precision.multiplies_tf32(origins.device)
     with precision.autocast(origins.device, number_format):
         edges = sampling.even_edges(len(origins), steps, origins.device)
         coarse = volume.render_coarse(field, segments, directions, edges, layout.unbounded, background)
@@ -340,7 +344,7 @@ def test_renders_of_any_field_are_pictures(seed, scene, rays, steps, bias, numbe
         assert (render.accumulation <= 1 + 1e-6).all() and (render.s >= 0).all() and (render.s <= 1 + 1e-5).all()
     torch.testing.assert_close(volume.accumulation_of(frozen), again.accumulation)
     # What lies behind 1e-3 of the light is left out; bfloat16 rounds logits at the samples of one render alone.
-    if number_format == "float32":
+    if number_format in ("float32", "tf32"):
         torch.testing.assert_close(again.rgb, coarse.rgb, rtol=0, atol=2e-3)
     for parameter in [*field.parameters(), *residual.parameters()]:
         assert parameter.grad is None or parameter.grad.isfinite().all()
@@ -540,7 +544,7 @@ def test_near_density_is_at_most_the_mean_density(data, num_rays, samples, reach
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-@covers(color.color_moments, color.palette_transform, color.apply_palette)
+@covers(color.color_moments, color.palette_transform, color.apply_palette, color.gaussian_distance)
 @given(st.data(), st.integers(1, 60), st.integers(1, 60), FLOATS)
 def test_transferred_colours_have_the_styles_mean(data, count, style_count, dtype):
     colors = data.draw(tensors((count, 3), -12, 0, dtype=dtype))
@@ -551,7 +555,11 @@ def test_transferred_colours_have_the_styles_mean(data, count, style_count, dtyp
     assert torch.linalg.eigvalsh(covariance).min() >= -1e-15
     matrix, offset = color.palette_transform(mean, covariance, *color.color_moments(style))
     transferred = color.apply_palette(colors, matrix, offset)
-    style_mean, _ = color.color_moments(style)
+    style_mean, style_covariance = color.color_moments(style)
+    distance = color.gaussian_distance(mean, covariance, style_mean, style_covariance)
+    back = color.gaussian_distance(style_mean, style_covariance, mean, covariance)
+    assert (mean - style_mean).norm() - 1e-6 <= distance <= 3.0
+    torch.testing.assert_close(distance, back, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(color.color_moments(transferred, weights)[0], style_mean, rtol=0, atol=1e-3)
     cut = color.apply_palette(colors, matrix, offset, clamp=True)
     assert (cut >= 0).all() and (cut <= 1).all()
@@ -585,14 +593,19 @@ def backbone():
     return vgg.load_backbone("vgg16-shift-tolerant")
 
 
-@covers(vgg.load_backbone, targets.fit_side, targets.feature_rows)
+@covers(vgg.load_backbone, targets.fit_side, targets.feature_rows, targets.covered_rows, targets.sample_rows)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(8, 24), st.floats(0, 1), SEEDS)
 def test_pictures_of_any_shape_have_features(backbone, height, width, side, contrast, seed):
     picture = contrast * torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(seed))
     picture.requires_grad_()
     fitted = targets.fit_side(picture, side)
     assert max(fitted.shape[-2:]) == side and min(fitted.shape[-2:]) >= 8
-    rows = targets.feature_rows(backbone(fitted))
+    maps = backbone(fitted)
+    rows = targets.feature_rows(maps)
+    accumulation = torch.rand(height, width, generator=torch.Generator().manual_seed(seed)) + contrast - 0.5
+    assert 1 <= len(targets.covered_rows(maps, accumulation)) <= len(rows) == len(targets.covered_rows(maps, None))
+    kept = targets.sample_rows(rows, max(1, len(rows) // 2))
+    assert len(kept) == max(1, len(rows) // 2) and targets.sample_rows(rows, len(rows)) is rows
     assert rows.shape[1] == vgg.FEATURE_CHANNELS and (rows >= 0).all() and rows.isfinite().all()
     (gradient,) = torch.autograd.grad(rows.square().mean(), picture)
     assert gradient.isfinite().all()
