@@ -167,6 +167,12 @@ class CoarseFewShotModel(Model):
                 self.field, segments, directions, edges, self.space.unbounded, self.background, thinning
             )
 
+    def render_rays(self, ray_bundle: RayBundle, num_samples: int) -> Tuple[DenseRender, Segments]:
+        """Renders rays with this many samples, placed without jitter; also returns the rays' segments."""
+        segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
+        edges = self.place_samples(segments, num_samples, None)
+        return self.render(segments, ray_bundle.directions, edges), segments
+
     def render_batch(self, origins: Tensor, directions: Tensor) -> Tuple[DenseRender, Tensor]:
         """Renders the rays of a training step, each process its share; also returns the samples' borders."""
         segments = self.space.segments(origins, directions)
@@ -182,9 +188,7 @@ class CoarseFewShotModel(Model):
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
         """`rgb`, `accumulation`, and `depth` in world units; in training also what the losses need."""
         if not self.training:
-            segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
-            edges = self.place_samples(segments, self.config.num_eval_samples, None)
-            render = self.render(segments, ray_bundle.directions, edges)
+            render, segments = self.render_rays(ray_bundle, self.config.num_eval_samples)
             depth = segments.distance(render.s.clamp(max=1.0 - 1e-4))
             return {"rgb": render.rgb, "accumulation": render.accumulation, "depth": depth}
         render, edges = self.render_batch(ray_bundle.origins, ray_bundle.directions)

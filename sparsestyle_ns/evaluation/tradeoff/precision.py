@@ -77,7 +77,7 @@ class PrecisionGroup:
         reference = in_chunks(bundle, samples, budget, lambda part: in_float64(model, part))
 
         def render() -> Tensor:
-            return in_chunks(bundle, samples, budget, lambda part: model.render(part, samples, None)[0].rgb)
+            return in_chunks(bundle, samples, budget, lambda part: model.render_rays(part, samples)[0].rgb)
 
         def case(precision: Precision) -> Callable[[], Values]:
             training = study.start(with_setting(study.coarse_config, "pipeline.model.precision", precision), budget)

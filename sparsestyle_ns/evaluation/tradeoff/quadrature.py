@@ -167,7 +167,7 @@ class Quadrature:
         numbers = multiples(preset)
 
         def render(bundle: RayBundle, samples: int) -> Tensor:
-            return model.render(bundle, samples, None)[0].rgb
+            return model.render_rays(bundle, samples)[0].rgb
 
         renders = Renders(self.study, render, render, max(numbers), preset, budget)
         self._by_number(axis, renders, numbers, budget)
