@@ -5,7 +5,7 @@ when it runs, so that help is there at once.
 """
 
 from pathlib import Path
-from typing import Annotated, Any, Callable, Dict, Optional, Sequence, Tuple
+from typing import Annotated, Any, Callable, Dict, Literal, Optional, Sequence, Tuple
 
 import tyro
 
@@ -75,8 +75,51 @@ def evaluate(
     print(f"{len(report.views)} held-out views; the report is {output_path}")
 
 
+@exit_on_input_error
+def export(
+    run: Annotated[Path, tyro.conf.Positional],
+    output_path: Path,
+    format: Literal["html", "ply", "mesh"] = "html",
+    resolution: int = 255,
+) -> None:
+    """Writes a stylised run as one file for those who don't have this package, and prints how close it is to the run.
+
+    html is a page that shows the scene in any browser with WebGL2, without server or network: drag to turn, wheel or
+    pinch to zoom. It has at most 30 MB; where it would have more, it gets fewer cells. ply is a cloud of coloured
+    points, mesh a PLY mesh with coloured vertices (by Open3D's Poisson reconstruction).
+
+    Args:
+        run: The run's folder or its config.yml.
+        output_path: The file to write.
+        format: What to write.
+        resolution: html: cells along a side of the scene's cube. 255 fits into the graphics memory that every browser
+            with WebGL2 promises.
+    """
+    from sparsestyle_ns.output_file import prepare_output
+    from sparsestyle_ns.run_folder import STYLE_METHOD, find_config
+
+    if not 32 <= resolution <= 1023:
+        raise InputError(f"--resolution {resolution} isn't between 32 and 1023; 255 suits most scenes.")
+    config = find_config(run, STYLE_METHOD)
+    example = "scene.html" if format == "html" else "scene.ply"
+    prepare_output(
+        output_path, "The scene", example
+    )  # rendering takes minutes, so what can fail without it fails before
+    from sparsestyle_ns.export.command import export_mesh, export_page, export_points, load_scene
+
+    scene = load_scene(config)
+    if format == "html":
+        export_page(scene, output_path, resolution)
+    elif format == "ply":
+        export_points(scene, output_path)
+    else:
+        export_mesh(scene, output_path)
+    print(f"The scene is {output_path.resolve()}")
+
+
 SUBCOMMANDS: Dict[str, Callable[..., Any]] = {
     "evaluate": evaluate,
+    "export": export,
     "gallery": gallery,
 }
 

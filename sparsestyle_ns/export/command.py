@@ -1,8 +1,10 @@
 """`sparsestyle export`: from a run to a file, with how far it is from the exact render."""
 
+import copy
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Dict, List, Literal
+from typing import Dict, List, Optional, Tuple
 
 import torch
 from jaxtyping import Float
@@ -14,15 +16,24 @@ from sparsestyle_ns.evaluation.held_out import rendered
 from sparsestyle_ns.evaluation.image_metrics import psnr
 from sparsestyle_ns.export.orbit import make_orbit, most_central, pinholes, resized, survey
 from sparsestyle_ns.export.page import build_page, fit_page
+from sparsestyle_ns.export.points import (
+    MIN_ACCUMULATION,
+    Likeness,
+    Points,
+    cross_likeness,
+    encode_ply,
+    joined,
+    likeness,
+    surface_points,
+    without_background,
+)
 from sparsestyle_ns.export.voxels import Voxels, bake_voxels, render_voxels
-from sparsestyle_ns.models.hier_style import HierStyleModel
+from sparsestyle_ns.models.hier_style import RAYS_PER_CALL, HierStyleModel
 from sparsestyle_ns.output_file import write_output
 from sparsestyle_ns.run_folder import load_run
 
 COMPARED_SIDE = 252
 """Pixels along the longer side of the pictures by which an export is measured, at most."""
-MIN_ACCUMULATION = 0.5
-"""Rays with less weight than this see no surface."""
 
 
 @dataclass
@@ -56,11 +67,16 @@ def load_scene(config_path: Path) -> StylisedScene:
     return StylisedScene(title, pipeline.model.eval(), pinholes(dataset.cameras.to("cpu")), names)
 
 
-def exact_pictures(scene: StylisedScene) -> List[Dict[str, Tensor]]:
-    """Exact renders of the training views, with at most `COMPARED_SIDE` pixels along a side, on the CPU."""
+def exact_pictures(scene: StylisedScene, longest: Optional[int]) -> List[Dict[str, Tensor]]:
+    """Exact renders of the training views, on the CPU.
+
+    Args:
+        longest: pixels along a side, at most; None for all that the cameras have.
+    """
     pictures = []
     for index in track(range(len(scene.cameras)), description="Exact renders"):
-        camera = resized(scene.cameras[index : index + 1], COMPARED_SIDE).to(scene.model.device)
+        camera = scene.cameras[index : index + 1]
+        camera = (camera if longest is None else resized(camera, longest)).to(scene.model.device)
         pictures.append({key: value.cpu() for key, value in rendered(scene.model, camera, "exact").items()})
     return pictures
 
@@ -75,12 +91,12 @@ def export_page(scene: StylisedScene, output_path: Path, resolution: int) -> Non
         InputError: the scene doesn't fit into a page, or the file can't be written.
     """
     model, cameras = scene.model, scene.cameras
-    exact = exact_pictures(scene)
+    exact = exact_pictures(scene, COMPARED_SIDE)
     opening = most_central(cameras)
     orbit = make_orbit(model.space, cameras, opening, median_depth(exact[opening]))
     views = survey(orbit, cameras)
     page = fit_page(
-        lambda resolution: bake_voxels(model, resolution, views),
+        lambda cells: bake_voxels(model, cells, views),
         lambda voxels: build_page(voxels, model, cameras, scene.names, orbit, scene.title),
         resolution,
     )
@@ -95,15 +111,65 @@ def export_page(scene: StylisedScene, output_path: Path, resolution: int) -> Non
     print(f"Mean of the training views at {width} × {height}: {sum(errors) / len(errors):.1f} dB")
 
 
+def export_points(scene: StylisedScene, output_path: Path) -> None:
+    """Writes the training views' surface points as PLY, and prints how well those of the others show each view.
+
+    Raises:
+        InputError: the file can't be written.
+    """
+    pictures, parts = _surfaces(scene)
+    points = joined(parts)
+    write_output(output_path, encode_ply(points), "The points", "scene.ply")
+    print(f"{len(points.positions):,} points, in the coordinates of nerfstudio's cameras")
+    print("Each view as the points of all others show it, one pixel each, against the exact render:")
+    _print_likeness(scene.names, cross_likeness(parts, scene.cameras, pictures))
+
+
+def export_mesh(scene: StylisedScene, output_path: Path) -> None:
+    """Writes a mesh with coloured vertices as PLY, and prints how well it shows each training view.
+
+    Raises:
+        InputError: there are too few surface points, or the file can't be written.
+    """
+    from sparsestyle_ns.export.mesh import encode_mesh, picture_of_mesh, poisson_mesh  # loads Open3D
+
+    pictures, parts = _surfaces(scene)
+    mesh = poisson_mesh(joined(parts))
+    with tempfile.TemporaryDirectory() as folder:
+        write_output(output_path, encode_mesh(mesh, Path(folder)), "The mesh", "scene.ply")
+    print(
+        f"{len(mesh.vertices):,} vertices, {len(mesh.triangles):,} triangles, in the coordinates of nerfstudio's cameras"
+    )
+    print("The mesh without light against the exact render:")
+    found = []
+    for index, picture in enumerate(pictures):
+        found.append(likeness(*picture_of_mesh(mesh, scene.cameras[index : index + 1]), picture))
+    _print_likeness(scene.names, found)
+
+
+def _surfaces(scene: StylisedScene) -> Tuple[List[Dict[str, Tensor]], List[Points]]:
+    """Full renders of the training views without background, and the points that each sees."""
+    background = scene.model.background
+    background = None if background is None else background.cpu()
+    pictures = [without_background(picture, background) for picture in exact_pictures(scene, None)]
+    parts = [surface_points(scene.cameras[index : index + 1], picture) for index, picture in enumerate(pictures)]
+    return pictures, parts
+
+
+def _print_likeness(names: List[str], found: List[Likeness]) -> None:
+    for name, (covered, value) in zip(names, found, strict=True):
+        print(f"  {name}: {100 * covered:.0f}% of its surfaces covered, PSNR there {value:.1f} dB")
+
+
 def page_picture(voxels: Voxels, model: HierStyleModel, camera: Cameras) -> Float[Tensor, "H W 3"]:
     """What the page shows of one camera, worked out in torch."""
     bundle = camera.generate_rays(camera_indices=0, keep_shape=True)
     background = torch.zeros(3) if model.background is None else model.background.cpu()
-    colors = []
+    space, colors = copy.deepcopy(model.space).cpu(), []
     for origins, directions in zip(
-        bundle.origins.view(-1, 3).split(1 << 13), bundle.directions.view(-1, 3).split(1 << 13), strict=True
+        bundle.origins.view(-1, 3).split(RAYS_PER_CALL), bundle.directions.view(-1, 3).split(RAYS_PER_CALL), strict=True
     ):
-        segments = model.space.to("cpu").segments(origins, directions)
+        segments = space.segments(origins, directions)
         colors.append(render_voxels(voxels, segments, model.config.num_steps, model.space.unbounded, background))
     return torch.cat(colors).view(bundle.origins.shape)
 
