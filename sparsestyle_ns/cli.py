@@ -117,10 +117,35 @@ def export(
     print(f"The scene is {output_path.resolve()}")
 
 
+@exit_on_input_error
+def prepare(
+    photos: Annotated[Path, tyro.conf.Positional],
+    output: Path,
+    poses: Literal["auto", "file", "colmap"] = "auto",
+) -> None:
+    """Makes a scene of three to eight photos: upright, of one size, and with the places they were taken from.
+
+    Says in words what is wrong with the photos: too few features or matches, too little overlap, a camera that only
+    turned, or only moved along its line of sight.
+
+    Args:
+        photos: Folder of the photos: JPEG, PNG, WebP, TIFF, and HEIC where pillow-heif is installed.
+        output: Folder to write the scene to.
+        poses: Where the photos were taken from: a poses_bounds.npy or transforms.json beside them (file), as COLMAP
+            works it out (colmap, through ns-process-data), or the file if there is one, else COLMAP (auto).
+    """
+    from sparsestyle_ns.prepare.command import prepare_scene
+
+    scene = prepare_scene(photos, output, poses)
+    print(f"{scene.folder} has {len(scene.names)} photos with poses")
+    print(f"Next: ns-train coarse-fewshot --data {scene.folder} {scene.parser}")
+
+
 SUBCOMMANDS: Dict[str, Callable[..., Any]] = {
     "evaluate": evaluate,
     "export": export,
     "gallery": gallery,
+    "prepare": prepare,
 }
 
 

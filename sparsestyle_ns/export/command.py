@@ -120,7 +120,7 @@ def export_points(scene: StylisedScene, output_path: Path) -> None:
     pictures, parts = _surfaces(scene)
     points = joined(parts)
     write_output(output_path, encode_ply(points), "The points", "scene.ply")
-    print(f"{len(points.positions):,} points, in the coordinates of nerfstudio's cameras")
+    print(f"{len(points.positions):,} points, in nerfstudio's coordinates")
     print("Each view as the points of all others show it, one pixel each, against the exact render:")
     _print_likeness(scene.names, cross_likeness(parts, scene.cameras, pictures))
 
@@ -137,9 +137,7 @@ def export_mesh(scene: StylisedScene, output_path: Path) -> None:
     mesh = poisson_mesh(joined(parts))
     with tempfile.TemporaryDirectory() as folder:
         write_output(output_path, encode_mesh(mesh, Path(folder)), "The mesh", "scene.ply")
-    print(
-        f"{len(mesh.vertices):,} vertices, {len(mesh.triangles):,} triangles, in the coordinates of nerfstudio's cameras"
-    )
+    print(f"{len(mesh.vertices):,} vertices, {len(mesh.triangles):,} triangles, in nerfstudio's coordinates")
     print("The mesh without light against the exact render:")
     found = []
     for index, picture in enumerate(pictures):

@@ -73,6 +73,6 @@ def picture_of_mesh(
     corners = np.asarray(mesh.triangles)[hits["primitive_ids"].numpy()[shown]]
     second, third = np.moveaxis(hits["primitive_uvs"].numpy()[shown], -1, 0)
     weights = np.stack([1.0 - second - third, second, third], axis=-1)
-    colors = np.zeros(rays.shape[:2] + (3,), np.float32)
+    colors = np.zeros((*rays.shape[:2], 3), np.float32)
     colors[shown] = np.einsum("pk,pkc->pc", weights, np.asarray(mesh.vertex_colors)[corners])
     return torch.from_numpy(colors), torch.from_numpy(shown)

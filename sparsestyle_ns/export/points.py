@@ -5,7 +5,7 @@ from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
@@ -118,7 +118,7 @@ def splat(points: Points, camera: Cameras) -> Tuple[Float[Tensor, "H W 3"], Bool
     column = torch.floor(float(camera.cx) + float(camera.fx) * local[:, 0] / depth)
     row = torch.floor(float(camera.cy) - float(camera.fy) * local[:, 1] / depth)
     seen = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    pixel: Int[Tensor, "points"] = (row * width + column)[seen].long()
+    pixel = (row * width + column)[seen].long()
     nearest = torch.full((height * width,), torch.inf).scatter_reduce_(0, pixel, depth[seen], "amin")
     front = depth[seen] == nearest[pixel]
     colors = torch.zeros(height * width, 3)
