@@ -121,8 +121,9 @@ def export_points(scene: StylisedScene, output_path: Path) -> None:
     points = joined(parts)
     write_output(output_path, encode_ply(points), "The points", "scene.ply")
     print(f"{len(points.positions):,} points, in nerfstudio's coordinates")
-    print("Each view as the points of all others show it, one pixel each, against the exact render:")
-    _print_likeness(scene.names, cross_likeness(parts, scene.cameras, pictures))
+    if len(parts) > 1:
+        print("Each view as the points of all others show it, one pixel each, against the exact render:")
+        _print_likeness(scene.names, cross_likeness(parts, scene.cameras, pictures))
 
 
 def export_mesh(scene: StylisedScene, output_path: Path) -> None:

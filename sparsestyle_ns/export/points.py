@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from sparsestyle_ns.rendering.volume import straight_color
+
 MIN_ACCUMULATION = 0.5
 """Rays with less weight than this see no surface."""
 MAX_JUMP = 0.1
@@ -53,10 +55,7 @@ def surface_points(camera: Cameras, picture: Dict[str, Tensor]) -> Points:
 
 def without_background(picture: Dict[str, Tensor], background: Optional[Float[Tensor, "3"]]) -> Dict[str, Tensor]:
     """A render with the colours of its surfaces alone, where pixels also show some background between them."""
-    accumulation = picture["accumulation"]
-    behind = 0.0 if background is None else (1.0 - accumulation) * background
-    rgb = (picture["rgb"] - behind) / accumulation.clamp(min=MIN_ACCUMULATION)
-    return {**picture, "rgb": rgb.clamp(0.0, 1.0)}
+    return {**picture, "rgb": straight_color(picture["rgb"], picture["accumulation"], background)}
 
 
 def at_edge(depth: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:

@@ -27,6 +27,7 @@ from sparsestyle_ns.rendering.volume import (
     freeze_samples,
     render_frozen_coarse,
     render_stylised,
+    straight_color,
 )
 
 RAYS_PER_CALL = 1 << 13
@@ -239,6 +240,14 @@ class HierStyleModel(Model):
             "accumulation": fine.accumulation,
             "depth": segments.distance(fine.s.clamp(max=1.0 - 1e-4)),
         }
+
+    def get_rgba_image(self, outputs: Dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """Colour without background, and opacity, for `ns-export tsdf` and ns-render's output rgba.
+
+        Opacity is the stylised geometry's, for `rgb_coarse` too.
+        """
+        color = straight_color(outputs[output_name], outputs["accumulation"], self.background)
+        return torch.cat([color, outputs["accumulation"]], dim=-1)
 
     def get_loss_dict(
         self, outputs: Dict[str, Tensor], batch: Dict[str, Any], metrics_dict: Optional[Dict[str, Tensor]] = None
