@@ -1,5 +1,6 @@
 """Lets every test say `from reference import ...`, and makes small scenes and runs that several tests look at."""
 
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -7,6 +8,7 @@ from typing import List
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -80,3 +82,26 @@ def runs(llff_scene: Path, painting: Path, tmp_path_factory: pytest.TempPathFact
     return SimpleNamespace(
         outputs=outputs, coarse=only_run(outputs, "coarse-fewshot"), style=only_run(outputs, "hier-style")
     )
+
+
+@pytest.fixture(scope="session")
+def patterned_run(runs: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The stylised run, which a few iterations left grey all over, with weights that make shapes and colours."""
+    from sparsestyle_ns.coarse_run import newest_checkpoint
+
+    folder = tmp_path_factory.mktemp("outputs") / "scene" / "hier-style" / "run"
+    shutil.copytree(runs.style, folder)
+    path = newest_checkpoint(folder / "nerfstudio_models")
+    state = torch.load(path, weights_only=True)
+    generator = torch.Generator().manual_seed(0)
+    for name, value in state["pipeline"].items():
+        if name.startswith(("_model.field.trunk", "_model.field.feature_head", "_model.residual")) and "weight" in name:
+            value.copy_(torch.randn(value.shape, generator=generator) * (2.0 / value.shape[1]) ** 0.5)
+        if name == "_model.field.trunk.layers.0.weight":
+            value[:, 3:] *= 0.4 ** torch.arange(value.shape[1] - 3).div(6, rounding_mode="floor")
+        if name == "_model.field.density_head.weight":
+            value.copy_(3.0 * torch.randn(value.shape, generator=generator))
+        if name == "_model.residual.color_head.weight":
+            value *= 6.0
+    torch.save(state, path)
+    return folder
