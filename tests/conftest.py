@@ -9,6 +9,7 @@ from typing import List
 import numpy as np
 import pytest
 import torch
+import yaml
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -89,8 +90,11 @@ def patterned_run(runs: SimpleNamespace, tmp_path_factory: pytest.TempPathFactor
     """The stylised run, which a few iterations left grey all over, with weights that make shapes and colours."""
     from sparsestyle_ns.coarse_run import newest_checkpoint
 
-    folder = tmp_path_factory.mktemp("outputs") / "scene" / "hier-style" / "run"
-    shutil.copytree(runs.style, folder)
+    outputs = tmp_path_factory.mktemp("outputs")
+    folder = shutil.copytree(runs.style, outputs / "scene" / "hier-style" / "run")
+    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+    config.output_dir, config.experiment_name, config.timestamp = outputs, "scene", "run"  # where ns-render looks
+    (folder / "config.yml").write_text(yaml.dump(config))
     path = newest_checkpoint(folder / "nerfstudio_models")
     state = torch.load(path, weights_only=True)
     generator = torch.Generator().manual_seed(0)
