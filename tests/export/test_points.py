@@ -1,6 +1,7 @@
 """Points and meshes lie on what the cameras see, with its colours, and files say so to other programs."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import open3d
@@ -23,6 +24,8 @@ from sparsestyle_ns.export.points import (
     surface_points,
     without_background,
 )
+from sparsestyle_ns.models.hier_style import HierStyleModel
+from sparsestyle_ns.rendering.volume import over_background
 
 WIDTH, HEIGHT = 96, 72
 
@@ -174,3 +177,13 @@ def test_what_can_not_be_exported_is_said_in_one_sentence(tmp_path, given, sente
         main(["export", *(part.format(tmp=tmp_path) for part in given)])
     assert ended.value.code.startswith(sentence.format(tmp=tmp_path))
     assert "\n" not in ended.value.code
+
+
+def test_ns_export_and_ns_render_get_colour_without_background_and_opacity():
+    color, background = torch.rand(4, 3, generator=torch.Generator().manual_seed(0)), torch.ones(3)
+    accumulation = torch.tensor([[1.0], [0.5], [0.1], [0.0]])
+    outputs = {"rgb": over_background(accumulation * color, accumulation, background), "accumulation": accumulation}
+    rgba = HierStyleModel.get_rgba_image(SimpleNamespace(background=background), outputs)
+    torch.testing.assert_close(rgba[:3, :3], color[:3])
+    assert rgba[3].tolist() == [0.0] * 4
+    assert torch.equal(rgba[:, 3:], accumulation)
