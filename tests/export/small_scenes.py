@@ -71,7 +71,22 @@ def scene(kind: str) -> SimpleNamespace:
     model = SimpleNamespace(space=space, background=background, config=SimpleNamespace(num_steps=NUM_STEPS))
     names = [f"{number}.png" for number in range(len(cameras))]
     orbit: Orbit = make_orbit(space, cameras, 0, 2.0)
-    return SimpleNamespace(model=model, voxels=balls(31, 12), cameras=cameras, names=names, orbit=orbit)
+    voxels = balls(31, 12)
+    if kind == "contracted":
+        put_walls(voxels)
+    return SimpleNamespace(model=model, voxels=voxels, cameras=cameras, names=names, orbit=orbit)
+
+
+def put_walls(voxels: Voxels) -> None:
+    """Coloured walls far away, where the contraction bends rays."""
+    axis = torch.linspace(-1.0, 1.0, len(voxels.codes))
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+    wall = points.abs().amax(dim=-1) > 0.7
+    voxels.codes[wall] = torch.cat(
+        [torch.full_like(points[..., :1], 120.0), 127.0 + 120.0 * torch.sin(9.0 * points)], -1
+    )[wall].to(torch.uint8)
+    voxels.known |= wall
+    voxels.occupied[:] = True
 
 
 def psnr(first, second) -> float:
