@@ -271,12 +271,80 @@ def _write_study(options: StudyOptions, run: Callable[..., Any], title: str) -> 
     print(f"The page is {write_study(sections, options.output_path, f'{title}: {scene.name}')}")
 
 
+@exit_on_input_error
+def export(
+    run: Annotated[Path, tyro.conf.Positional],
+    output_path: Path,
+    format: Literal["html", "ply", "mesh"] = "html",
+    resolution: int = 255,
+) -> None:
+    """Writes a stylised run as one file for those who don't have this package, and prints how close it is to the run.
+
+    html is a page that shows the scene in any browser with WebGL2, without server or network: drag to turn, wheel or
+    pinch to zoom. It has at most 30 MB; where it would have more, it gets fewer cells. ply is a cloud of coloured
+    points, mesh a PLY mesh with coloured vertices (by Open3D's Poisson reconstruction).
+
+    Args:
+        run: The run's folder or its config.yml.
+        output_path: The file to write.
+        format: What to write.
+        resolution: html: cells along a side of the scene's cube. 255 fits into the graphics memory that every browser
+            with WebGL2 promises.
+    """
+    from sparsestyle_ns.output_file import prepare_output
+    from sparsestyle_ns.run_folder import STYLE_METHOD, find_config
+
+    if not 32 <= resolution <= 1023:
+        raise InputError(f"--resolution {resolution} isn't between 32 and 1023; 255 suits most scenes.")
+    config = find_config(run, STYLE_METHOD)
+    example = "scene.html" if format == "html" else "scene.ply"
+    prepare_output(
+        output_path, "The scene", example
+    )  # rendering takes minutes, so what can fail without it fails before
+    from sparsestyle_ns.export.command import export_mesh, export_page, export_points, load_scene
+
+    scene = load_scene(config)
+    if format == "html":
+        export_page(scene, output_path, resolution)
+    elif format == "ply":
+        export_points(scene, output_path)
+    else:
+        export_mesh(scene, output_path)
+    print(f"The scene is {output_path.resolve()}")
+
+
+@exit_on_input_error
+def prepare(
+    photos: Annotated[Path, tyro.conf.Positional],
+    output: Path,
+    poses: Literal["auto", "file", "colmap"] = "auto",
+) -> None:
+    """Makes a scene of three to eight photos: upright, of one size, and with the places they were taken from.
+
+    Says in words what is wrong with the photos: too few features or matches, too little overlap, a camera that only
+    turned, or only moved along its line of sight.
+
+    Args:
+        photos: Folder of the photos: JPEG, PNG, WebP, TIFF, and HEIC where pillow-heif is installed.
+        output: Folder to write the scene to.
+        poses: Where the photos were taken from: a poses_bounds.npy or transforms.json beside them (file), as COLMAP
+            works it out (colmap, through ns-process-data), or the file if there is one, else COLMAP (auto).
+    """
+    from sparsestyle_ns.prepare.command import prepare_scene
+
+    scene = prepare_scene(photos, output, poses)
+    print(f"{scene.folder} has {len(scene.names)} photos with poses")
+    print(f"Next: ns-train coarse-fewshot --data {scene.folder} {scene.parser}")
+
+
 SUBCOMMANDS: Dict[str, Callable[..., Any]] = {
     "ablate": ablate,
     "compare": compare,
     "effects": effects,
     "evaluate": evaluate,
+    "export": export,
     "gallery": gallery,
+    "prepare": prepare,
     "tradeoff": tradeoff,
 }
 

@@ -7,8 +7,6 @@ without a network and can be sent as it is. `collect_run` gets a run's pictures 
 
 import base64
 import io
-import os
-import tempfile
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -19,6 +17,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageOps
 
 from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.output_file import prepare_output, write_output
 from sparsestyle_ns.page import html_page
 from sparsestyle_ns.run_folder import STYLE_METHOD, find_config, load_run
 
@@ -26,6 +25,9 @@ LONGEST_SIDE = 512
 """Pixels that a picture on the page has at most along its longer side."""
 LOSSLESS_PIXELS = 200_000
 """Pictures with at most this many pixels go into the page as PNG, larger ones as JPEG."""
+
+EXAMPLE_NAME = "index.html"
+"""A good name for a page."""
 
 Pixels = UInt8[np.ndarray, "H W 3"]
 
@@ -108,20 +110,7 @@ def write_page(runs: Sequence[RunPictures], output_path: Path, title: str) -> Pa
 
 def write_document(page: str, output_path: Path) -> Path:
     """Writes a whole HTML page as `write_page` does."""
-    prepare_folder(output_path)
-    try:
-        handle, unfinished = tempfile.mkstemp(prefix=".gallery-", dir=output_path.parent)
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(page)
-            os.chmod(unfinished, 0o644)
-            os.replace(unfinished, output_path)
-        except BaseException:
-            os.unlink(unfinished)
-            raise
-    except OSError as error:
-        raise _not_writable(output_path, error) from error
-    return output_path.resolve()
+    return write_output(output_path, page.encode(), "The page", EXAMPLE_NAME)
 
 
 def prepare_folder(output_path: Path) -> None:
@@ -130,20 +119,7 @@ def prepare_folder(output_path: Path) -> None:
     Raises:
         InputError: it can't be made or written to, or the page's name is that of a folder.
     """
-    if output_path.is_dir():
-        raise InputError(f"--output-path {output_path} is a folder; name a file, such as {output_path / 'index.html'}.")
-    try:
-        output_path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=output_path.parent):
-            pass
-    except OSError as error:
-        raise _not_writable(output_path, error) from error
-
-
-def _not_writable(output_path: Path, error: OSError) -> InputError:
-    return InputError(
-        f"The page can't be written to {output_path} ({error.strerror}); name another file with --output-path."
-    )
+    prepare_output(output_path, "The page", EXAMPLE_NAME)
 
 
 def page_html(runs: Sequence[RunPictures], title: str) -> str:

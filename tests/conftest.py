@@ -1,5 +1,6 @@
 """Lets every test say `from reference import ...`, and makes small scenes and runs that several tests look at."""
 
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,6 +9,8 @@ from typing import TYPE_CHECKING, Dict, List
 import hypothesis
 import numpy as np
 import pytest
+import torch
+import yaml
 from PIL import Image
 
 if TYPE_CHECKING:
@@ -112,3 +115,29 @@ def runs(llff_scene: Path, painting: Path, tmp_path_factory: pytest.TempPathFact
     return SimpleNamespace(
         outputs=outputs, coarse=only_run(outputs, "coarse-fewshot"), style=only_run(outputs, "hier-style")
     )
+
+
+@pytest.fixture(scope="session")
+def patterned_run(runs: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The stylised run, which a few iterations left grey all over, with weights that make shapes and colours."""
+    from sparsestyle_ns.coarse_run import newest_checkpoint
+
+    outputs = tmp_path_factory.mktemp("outputs")
+    folder = shutil.copytree(runs.style, outputs / "scene" / "hier-style" / "run")
+    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+    config.output_dir, config.experiment_name, config.timestamp = outputs, "scene", "run"  # where ns-render looks
+    (folder / "config.yml").write_text(yaml.dump(config))
+    path = newest_checkpoint(folder / "nerfstudio_models")
+    state = torch.load(path, weights_only=True)
+    generator = torch.Generator().manual_seed(0)
+    for name, value in state["pipeline"].items():
+        if name.startswith(("_model.field.trunk", "_model.field.feature_head", "_model.residual")) and "weight" in name:
+            value.copy_(torch.randn(value.shape, generator=generator) * (2.0 / value.shape[1]) ** 0.5)
+        if name == "_model.field.trunk.layers.0.weight":
+            value[:, 3:] *= 0.4 ** torch.arange(value.shape[1] - 3).div(6, rounding_mode="floor")
+        if name == "_model.field.density_head.weight":
+            value.copy_(3.0 * torch.randn(value.shape, generator=generator))
+        if name == "_model.residual.color_head.weight":
+            value *= 6.0
+    torch.save(state, path)
+    return folder

@@ -31,6 +31,7 @@ from sparsestyle_ns.rendering.volume import (
     freeze_samples,
     render_frozen_coarse,
     render_stylised,
+    straight_color,
 )
 
 RAYS_PER_CALL = 1 << 13
@@ -285,6 +286,14 @@ class HierStyleModel(Model):
             yield
         finally:
             self.render_mode.value = before
+
+    def get_rgba_image(self, outputs: Dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """Colour without background, and opacity, for `ns-export tsdf` and ns-render's output rgba.
+
+        Opacity is the stylised geometry's, for `rgb_coarse` too.
+        """
+        color = straight_color(outputs[output_name], outputs["accumulation"], self.background)
+        return torch.cat([color, outputs["accumulation"]], dim=-1)
 
     def get_loss_dict(
         self, outputs: Dict[str, Tensor], batch: Dict[str, Any], metrics_dict: Optional[Dict[str, Tensor]] = None

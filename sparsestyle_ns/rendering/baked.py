@@ -103,7 +103,7 @@ class BakedVolume:
         lower = scaled.long().clamp(0, self.resolution - 1)
         return lower, scaled - lower
 
-    def _rows(self, voxels: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
+    def rows(self, voxels: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
         """Where the codes of voxels lie."""
         x, y, z = (voxels // SIDE).unbind(-1)
         half = SIDE // 2
@@ -119,7 +119,7 @@ class BakedVolume:
         """
         lower = _unravel(_ravel(cells, self.resolution).unique(), self.resolution)
         voxels = (lower[:, None] + self._offsets).flatten(0, 1)
-        voxels = voxels[self.codes.view(-1, 8)[self._rows(voxels), 0] == 0]
+        voxels = voxels[self.codes.view(-1, 8)[self.rows(voxels), 0] == 0]
         voxels = _unravel(_ravel(voxels, self.resolution + 1).unique(), self.resolution + 1)
         if len(voxels) == 0:
             return
@@ -127,7 +127,7 @@ class BakedVolume:
         codes = self.codes.view(-1, 8)
         for part in voxels.split(POINTS_PER_CALL):
             positions = part.float() * (2.0 / self.resolution) - 1.0
-            codes[self._rows(part)] = encode(self.shade(positions))
+            codes[self.rows(part)] = encode(self.shade(positions))
 
     def _make_room(self, voxels: Int[Tensor, "voxels 3"]) -> None:
         """Gives a slot to each brick that voxels lie in and that has none."""
@@ -145,7 +145,7 @@ class BakedVolume:
         lower, fraction = self.cells(positions)
         self.fill(lower)
         near = torch.where(self._offsets.bool(), fraction[:, None], 1.0 - fraction[:, None])
-        codes = self.codes.view(-1, 8)[self._rows(lower[:, None] + self._offsets)]
+        codes = self.codes.view(-1, 8)[self.rows(lower[:, None] + self._offsets)]
         return decode((near.prod(dim=-1)[..., None] * codes).sum(dim=1))
 
     def density_and_feature(

@@ -64,6 +64,17 @@ def over_background(
     return rgb if background is None else rgb + (1.0 - accumulation) * background
 
 
+def straight_color(
+    rgb: Float[Tensor, "*batch 3"], accumulation: Float[Tensor, "*batch 1"], background: Optional[Float[Tensor, "3"]]
+) -> Float[Tensor, "*batch 3"]:
+    """The scene's own colour, in [0, 1], from a render in front of a background: the inverse of `over_background`.
+
+    Black where a ray has no weight.
+    """
+    own = rgb if background is None else rgb - (1.0 - accumulation) * background
+    return torch.where(accumulation > 1e-10, own / accumulation.clamp(min=1e-10), 0.0).clamp(0.0, 1.0)
+
+
 def mean_position(weights: Float[Tensor, "rays samples"], s: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays 1"]:
     """Σ w s / Σ w; 1, the segment's end, where a ray has no weight."""
     total = weights.sum(dim=-1, keepdim=True)

@@ -1,0 +1,1 @@
+"""Stylised scenes for people without this package: a page, coloured points, a mesh."""

@@ -1,0 +1,78 @@
+"""A coloured mesh of a scene's surfaces, made as nerfstudio's `ns-export poisson` makes one, with Open3D.
+
+The points are those of the training views, not of random rays, and every vertex has the colour of the points around it.
+"""
+
+from pathlib import Path
+from typing import Tuple
+
+import numpy as np
+import open3d
+import torch
+from jaxtyping import Bool, Float
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.export.points import Points
+
+OCTREE_DEPTH = 9
+"""Levels of the Poisson solver's octree, as in `ns-export poisson`."""
+THIN_SHARE = 0.1
+"""Share of the vertices, those with the fewest points around them, that are no surface (as in `ns-export poisson`)."""
+NORMAL_NEIGHBOURS = 30
+FAR = 4.0
+"""Vertices farther from any point than this many times the points' usual distance from each other are invented."""
+MIN_POINTS = 100
+
+
+def poisson_mesh(points: Points) -> open3d.geometry.TriangleMesh:
+    """A mesh through surface points, with holes where they are far apart.
+
+    Raises:
+        InputError: there are too few points.
+    """
+    if len(points.positions) < MIN_POINTS:
+        raise InputError(
+            f"The views show only {len(points.positions)} surface points, too few for a mesh; train the coarse field "
+            "longer."
+        )
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.positions.double().numpy()))
+    cloud.colors = open3d.utility.Vector3dVector(points.colors.double().numpy())
+    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
+    normals = np.asarray(cloud.normals)
+    outward = np.einsum("pc,pc->p", normals, (points.origins - points.positions).double().numpy())
+    normals[outward < 0] *= -1  # surfaces face the camera that saw them
+    mesh, density = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=OCTREE_DEPTH, n_threads=1)
+    vertices = open3d.geometry.PointCloud(mesh.vertices)
+    spacing = float(np.median(cloud.compute_nearest_neighbor_distance()))
+    distance = np.asarray(vertices.compute_point_cloud_distance(cloud))
+    density = np.asarray(density)
+    mesh.remove_vertices_by_mask((density < np.quantile(density, THIN_SHARE)) | (distance > FAR * spacing))
+    return mesh
+
+
+def encode_mesh(mesh: open3d.geometry.TriangleMesh, folder: Path) -> bytes:
+    """A binary PLY file with the vertices' colours and normals; Open3D writes it by way of a folder."""
+    mesh.compute_vertex_normals()
+    path = folder / "mesh.ply"
+    open3d.io.write_triangle_mesh(str(path), mesh)
+    return path.read_bytes()
+
+
+def picture_of_mesh(
+    mesh: open3d.geometry.TriangleMesh, camera: Cameras
+) -> Tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
+    """What one pinhole camera sees of a mesh without light: colours, and where there are any."""
+    bundle = camera.generate_rays(camera_indices=0, keep_shape=True)
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(open3d.t.geometry.TriangleMesh.from_legacy(mesh))
+    rays = torch.cat([bundle.origins, bundle.directions], dim=-1).numpy()
+    hits = scene.cast_rays(open3d.core.Tensor(rays))
+    shown = np.isfinite(hits["t_hit"].numpy())
+    corners = np.asarray(mesh.triangles)[hits["primitive_ids"].numpy()[shown]]
+    second, third = np.moveaxis(hits["primitive_uvs"].numpy()[shown], -1, 0)
+    weights = np.stack([1.0 - second - third, second, third], axis=-1)
+    colors = np.zeros((*rays.shape[:2], 3), np.float32)
+    colors[shown] = np.einsum("pk,pkc->pc", weights, np.asarray(mesh.vertex_colors)[corners])
+    return torch.from_numpy(colors), torch.from_numpy(shown)

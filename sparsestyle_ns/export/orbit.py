@@ -1,0 +1,136 @@
+"""Cameras of the page: the training views as pinholes, and how far one may turn away from the one it opens with.
+
+A turned camera is the opening one, first pitched about its own right axis and then yawed about the scene's up axis,
+both through a target on its line of sight. The page does the same (`turnedPose` in page.js).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Iterator, List, Tuple
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from torch import Tensor
+
+from sparsestyle_ns.rendering.space import BoxSpace, ForwardFacingSpace, Space
+
+STEEPEST = 85.0
+"""Degrees above or below the horizon that a camera may look from."""
+LEAST_TURN, MOST_TURN = 5.0, 30.0
+"""Degrees that a camera may be turned by in a forward-facing scene, wherever its photos were taken: farther out is what
+no photo shows, and the fields there are guesses of which a page and the exact render show different ones."""
+BEYOND_PHOTOS = 1.5
+"""How far cameras of a forward-facing scene may turn, as a multiple of the largest angle between two photos."""
+SURVEY_SIDE = 96
+"""Pixels along the longer side of the pictures that find out what can be seen."""
+
+
+@dataclass
+class Orbit:
+    """Where the camera of a page may go.
+
+    Attributes:
+        opening: number of the camera it starts with.
+        target: the point it turns about, in world units.
+        up: the axis of yaw.
+        yaw, pitch: lowest and highest angle, in degrees, from the opening camera.
+        distance: nearest and farthest, as multiples of the opening camera's distance from the target.
+    """
+
+    opening: int
+    target: Float[Tensor, "3"]
+    up: Float[Tensor, "3"]
+    yaw: Tuple[float, float]
+    pitch: Tuple[float, float]
+    distance: Tuple[float, float]
+
+
+def pinholes(cameras: Cameras) -> Cameras:
+    """The same cameras without distortion, which a page doesn't draw."""
+    return Cameras(
+        camera_to_worlds=cameras.camera_to_worlds,
+        fx=cameras.fx,
+        fy=cameras.fy,
+        cx=cameras.cx,
+        cy=cameras.cy,
+        width=cameras.width,
+        height=cameras.height,
+        camera_type=CameraType.PERSPECTIVE,
+    )
+
+
+def resized(camera: Cameras, longest: int) -> Cameras:
+    """One camera with at most `longest` pixels along its longer side."""
+    smaller = pinholes(camera)
+    scale = longest / int(max(camera.width.max(), camera.height.max()))
+    if scale < 1.0:
+        smaller.rescale_output_resolution(scale)
+    return smaller
+
+
+def most_central(cameras: Cameras) -> int:
+    """The camera that the others stand around: the nearest to their mean position."""
+    positions = cameras.camera_to_worlds[..., 3]
+    return int((positions - positions.mean(dim=0)).norm(dim=-1).argmin())
+
+
+def make_orbit(space: Space, cameras: Cameras, opening: int, depth: float) -> Orbit:
+    """Where one may go from the camera `opening` without leaving what the photos tell of.
+
+    Around an object (box) the target is beside its centre, elsewhere at the depth of what the camera sees.
+
+    Args:
+        depth: how far what the opening camera sees is away, in world units.
+    """
+    pose = cameras.camera_to_worlds[opening]
+    position, forward = pose[:, 3], -pose[:, 2]
+    if isinstance(space, BoxSpace):
+        center = 0.5 * (space.minimum + space.maximum).cpu()
+        depth = max(float((center - position) @ forward), 1e-3)
+    target = position + depth * forward
+    if isinstance(space, ForwardFacingSpace):
+        around = torch.nn.functional.normalize(cameras.camera_to_worlds[..., 3] - target, dim=-1)
+        widest = math.degrees(math.acos(float((around @ around.T).amin().clamp(-1.0, 1.0))))
+        turn = min(max(BEYOND_PHOTOS * widest, LEAST_TURN), MOST_TURN)
+        # NDC has nothing in front of the near plane, and cameras beyond it would see what is behind them.
+        nearest = 1.0 - 0.5 * min(space.near / depth, 1.0)
+        return Orbit(opening, target, torch.tensor([0.0, 1.0, 0.0]), (-turn, turn), (-turn, turn), (nearest, 1.3))
+    up = torch.tensor([0.0, 0.0, 1.0])  # nerfstudio's worlds stand upright
+    elevation = math.degrees(math.asin(float((-forward @ up).clamp(-1.0, 1.0))))
+    pitch = (min(0.0, -STEEPEST - elevation), max(0.0, STEEPEST - elevation))
+    return Orbit(opening, target, up, (-180.0, 180.0), pitch, (0.4, 2.5))
+
+
+def turned(orbit: Orbit, cameras: Cameras, yaw: float, pitch: float) -> Cameras:
+    """The opening camera, turned by angles in degrees."""
+    camera = pinholes(cameras[orbit.opening : orbit.opening + 1])
+    pose = camera.camera_to_worlds[0]
+    turn = rotation(orbit.up, yaw) @ rotation(pose[:, 0], -pitch)
+    moved = turn @ pose
+    moved[:, 3] = orbit.target + turn @ (pose[:, 3] - orbit.target)
+    camera.camera_to_worlds = moved[None]
+    return camera
+
+
+def rotation(axis: Float[Tensor, "3"], degrees: float) -> Float[Tensor, "3 3"]:
+    """Rotation about a unit vector by the right-hand rule (Rodrigues)."""
+    x, y, z = axis.tolist()
+    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = math.radians(degrees)
+    return torch.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+
+
+def survey(orbit: Orbit, cameras: Cameras) -> List[Cameras]:
+    """Small cameras that between them see what the page may show: the training views, and turns of the opening one."""
+    views = [cameras[index : index + 1] for index in range(len(cameras))]
+    views += [turned(orbit, cameras, yaw, pitch) for yaw, pitch in _directions(orbit)]
+    return [resized(view, SURVEY_SIDE) for view in views]
+
+
+def _directions(orbit: Orbit) -> Iterator[Tuple[float, float]]:
+    """(yaw, pitch) at most 30 degrees apart, and at least three of each."""
+    counts = [max(3, math.ceil((high - low) / 30.0) + 1) for low, high in (orbit.yaw, orbit.pitch)]
+    for yaw in torch.linspace(*orbit.yaw, counts[0]).tolist():
+        for pitch in torch.linspace(*orbit.pitch, counts[1]).tolist():
+            yield yaw, pitch

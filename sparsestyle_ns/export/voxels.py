@@ -1,0 +1,123 @@
+"""A stylised scene as bytes on a voxel grid: what a page carries, and how its renderer reads it.
+
+σ_f and c_f depend on the position alone, so that a grid of them is the scene. The page's renderer (raymarch.frag) takes
+the exact render's steps through it; `render_voxels` is that renderer in torch, by which the page's error is measured.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Sequence
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from nerfstudio.cameras.cameras import Cameras
+from rich.progress import track
+from torch import Tensor
+from torch.nn import functional as F
+
+from sparsestyle_ns.models.hier_style import RAYS_PER_CALL, HierStyleModel
+from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT, SIDE, Rays, render_baked
+from sparsestyle_ns.rendering.density_grid import Occupancy, march
+from sparsestyle_ns.rendering.space import ForwardFacingSpace, Segments
+from sparsestyle_ns.rendering.volume import render_packed
+
+EMPTY = 1
+"""Code of density 0, as in baked rendering, where 0 stands for a value that isn't known."""
+ROUNDING = 0.05
+"""Part of a code's step that a graphics card's interpolation may be off; less than that above `EMPTY` is empty."""
+STYLISED = slice(1, 5)
+"""Where a baked volume's codes have σ_f and c_f."""
+CELLS_PER_CALL = 1 << 16
+
+
+@dataclass
+class Voxels:
+    """σ_f and c_f as bytes, on a grid of the cube whose borders are voxels too.
+
+    Attributes:
+        codes: σ_f (coded as in `rendering/baked.py`) and c_f (of 255); `EMPTY` and black where nothing is known.
+        known: voxels that have values.
+        occupied: cells of a grid of its own in which samples count.
+    """
+
+    codes: UInt8[Tensor, "x y z 4"]
+    known: Bool[Tensor, "x y z"]
+    occupied: Bool[Tensor, "u v w"]
+
+    @property
+    def resolution(self) -> int:
+        """Cells along a side; there is one voxel more."""
+        return len(self.codes) - 1
+
+
+@torch.no_grad()
+def bake_voxels(model: HierStyleModel, resolution: int, cameras: Sequence[Cameras]) -> Voxels:
+    """Evaluates a model's fields wherever one of some cameras may see them.
+
+    That is in bricks of 8³ cells that their rays reach before 99.9% of the light is gone, in cells that aren't empty.
+
+    Args:
+        model: in evaluation mode.
+        resolution: cells along a side of the cube.
+        cameras: one camera each, with a ray for each pixel; a brick should be some pixels wide.
+    """
+    volume, config = model.bake(resolution), model.config
+    for camera in track(cameras, description="Finding what can be seen"):
+        bundle = camera.to(model.device).generate_rays(camera_indices=0, keep_shape=False).flatten()
+        for origins, directions in zip(
+            bundle.origins.split(RAYS_PER_CALL), bundle.directions.split(RAYS_PER_CALL), strict=True
+        ):
+            segments = model.space.segments(origins, directions)
+            rays = Rays(segments, model.occupancy, config.num_steps, model.space.unbounded, config.min_transmittance)
+            render_baked(volume, rays, model.background)
+    seen = (volume.slots > 0).float()
+    for axis in range(3):
+        seen = seen.repeat_interleave(SIDE, dim=axis).narrow(axis, 0, resolution)
+    occupied = F.adaptive_max_pool3d(model.occupancy.occupied.float()[None], resolution)[0] > 0
+    cells = (seen > 0) & (occupied | last_step_cells(model, resolution))
+    for part in track(cells.nonzero().split(CELLS_PER_CALL), description="Baking"):
+        volume.fill(part)
+    known = F.max_pool3d(F.pad(cells.float()[None], (1,) * 6), kernel_size=2, stride=1)[0] > 0
+    codes = torch.zeros(*known.shape, 4, dtype=torch.uint8, device=known.device)
+    codes[..., 0] = EMPTY
+    codes[known] = volume.codes.view(-1, 8)[volume.rows(known.nonzero()), STYLISED]
+    return Voxels(codes.cpu(), known.cpu(), model.occupancy.occupied.cpu())
+
+
+def last_step_cells(model: HierStyleModel, resolution: int) -> Bool[Tensor, "x y z"]:
+    """Cells that a ray's last step may lie in, where it goes on to infinity and counts in empty cells too."""
+    cells = torch.zeros(resolution, resolution, resolution, dtype=torch.bool, device=model.device)
+    if model.space.unbounded:
+        outer = math.floor((1.0 - 1.0 / model.config.num_steps) * resolution)
+        cells[..., outer:] = True
+        if not isinstance(model.space, ForwardFacingSpace):  # infinity is on all sides of the cube
+            inner = slice(resolution - outer, outer)
+            cells[:] = True
+            cells[inner, inner, inner] = False
+    return cells
+
+
+@torch.no_grad()
+def render_voxels(
+    voxels: Voxels, segments: Segments, num_steps: int, unbounded: bool, background: Float[Tensor, "3"]
+) -> Float[Tensor, "rays 3"]:
+    """What the page shows on each ray."""
+    occupancy = Occupancy(len(voxels.occupied))
+    occupancy.occupied = voxels.occupied
+    samples = march(segments, occupancy, num_steps, unbounded)
+    values = interpolate(voxels, samples.positions)
+    steps = values[:, 0] - EMPTY
+    density = torch.where(steps > ROUNDING, DENSITY_UNIT * torch.expm1(DENSITY_STEP * steps), 0.0)
+    return render_packed(samples, len(segments.hit), density, values[:, 1:] / 255.0, background).rgb
+
+
+def interpolate(voxels: Voxels, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points 4"]:
+    """Codes between voxels, trilinear; outside of the cube those on its border."""
+    scaled = (0.5 * positions + 0.5).clamp(0.0, 1.0) * voxels.resolution
+    lower = scaled.long().clamp(max=voxels.resolution - 1)
+    fraction = scaled - lower
+    total = positions.new_zeros(len(positions), 4)
+    for corner in torch.cartesian_prod(*[torch.arange(2)] * 3):
+        weight = torch.where(corner.bool(), fraction, 1.0 - fraction).prod(dim=-1)
+        total += weight[:, None] * voxels.codes[tuple((lower + corner).unbind(-1))]
+    return total

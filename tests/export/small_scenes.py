@@ -1,0 +1,98 @@
+"""Small scenes of voxels in each kind of space, with cameras that look at them."""
+
+import math
+from types import SimpleNamespace
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import SceneBox
+
+from sparsestyle_ns.export.orbit import Orbit, make_orbit
+from sparsestyle_ns.export.voxels import EMPTY, Voxels
+from sparsestyle_ns.rendering.space import BoxSpace, ContractedSpace, ForwardFacingSpace
+
+WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
+NUM_STEPS = 48
+
+
+def look_from(*places, target=(0.0, 0.0, 0.0)) -> Cameras:
+    """Cameras that look at a target, z up; they don't have their centre in the middle."""
+    poses = []
+    for place in places:
+        back = torch.nn.functional.normalize(torch.tensor(place) - torch.tensor(target), dim=0)
+        right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), back), dim=0)
+        poses.append(torch.stack([right, torch.linalg.cross(back, right), back, torch.tensor(place)], dim=-1))
+    return Cameras(torch.stack(poses), fx=FOCAL, fy=0.9 * FOCAL, cx=30.0, cy=27.0, width=WIDTH, height=HEIGHT)
+
+
+def look_ahead(*places) -> Cameras:
+    """Cameras that look along −z, y up, as those of a forward-facing scene do."""
+    poses = torch.eye(4)[:3].repeat(len(places), 1, 1)
+    poses[:, :, 3] = torch.tensor(places)
+    return Cameras(poses, fx=FOCAL, fy=FOCAL, cx=32.0, cy=24.0, width=WIDTH, height=HEIGHT)
+
+
+def balls(resolution: int, cells: int) -> Voxels:
+    """Two coloured balls, soft at the edge, in a thin fog; cells away from them are empty."""
+
+    def distances(points):
+        centers = torch.tensor([[-0.35, 0.1, 0.0], [0.4, -0.2, 0.15]])
+        return (points[..., None, :] - centers).norm(dim=-1)
+
+    axis = torch.linspace(-1.0, 1.0, resolution + 1)
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+    first, second = distances(points).unbind(-1)
+    code = EMPTY + 170.0 * torch.sigmoid(30.0 * (0.3 - first)) + 140.0 * torch.sigmoid(30.0 * (0.35 - second))
+    shade = 0.5 + 0.5 * torch.sin(6.0 * points)
+    colors = torch.where((first < second)[..., None], shade, 1.0 - shade.flip(-1))
+    codes = torch.cat([code[..., None], 255.0 * colors], dim=-1).round().clamp(0, 255).to(torch.uint8)
+    middle = (torch.arange(cells) + 0.5) * (2.0 / cells) - 1.0
+    at = torch.stack(torch.meshgrid(middle, middle, middle, indexing="ij"), dim=-1)
+    occupied = distances(at).amin(dim=-1) < 0.6
+    known = (distances(points).amin(dim=-1) < 0.9) | (points.abs().amax(dim=-1) > 0.9)
+    codes[~known] = torch.tensor([EMPTY, 0, 0, 0], dtype=torch.uint8)
+    return Voxels(codes, known, occupied)
+
+
+def scene(kind: str) -> SimpleNamespace:
+    """`.model` as far as a page needs one, `.voxels`, `.cameras`, `.names` and `.orbit`."""
+    background = None
+    if kind == "ndc":
+        box = SceneBox(torch.tensor([[-1.2, -1.3, -1.0], [1.2, 1.3, 1.0]]))
+        space = ForwardFacingSpace(box, (2 * FOCAL / WIDTH, 2 * FOCAL / HEIGHT), 1.0, (1.4, 6.0))
+        cameras = look_ahead((-0.2, 0.0, 0.0), (0.0, 0.1, 0.0), (0.2, 0.0, 0.05))
+    elif kind == "box":
+        space = BoxSpace(SceneBox(torch.tensor([[-1.0, -1.2, -0.8], [1.0, 1.2, 0.8]])))
+        cameras = look_from((2.5, 0.4, 0.9), (-1.5, 2.0, 1.2), (0.3, -2.6, 0.2))
+        background = torch.tensor([1.0, 0.9, 0.8])
+    else:
+        space = ContractedSpace(unit=3.0)
+        cameras = look_from((3.3, 1.2, 1.5), (-3.0, 2.4, 1.2), (0.9, -3.9, 0.6))
+    model = SimpleNamespace(space=space, background=background, config=SimpleNamespace(num_steps=NUM_STEPS))
+    names = [f"{number}.png" for number in range(len(cameras))]
+    orbit: Orbit = make_orbit(space, cameras, 0, 6.0 if kind == "contracted" else 2.0)
+    voxels = balls(31, 12)
+    if kind == "contracted":
+        put_walls(voxels)
+    return SimpleNamespace(model=model, voxels=voxels, cameras=cameras, names=names, orbit=orbit)
+
+
+def put_walls(voxels: Voxels) -> None:
+    """Coloured walls far away, where the contraction bends rays."""
+    axis = torch.linspace(-1.0, 1.0, len(voxels.codes))
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+    wall = points.abs().amax(dim=-1) > 0.7
+    voxels.codes[wall] = torch.cat(
+        [torch.full_like(points[..., :1], 120.0), 127.0 + 120.0 * torch.sin(9.0 * points)], -1
+    )[wall].to(torch.uint8)
+    voxels.known |= wall
+    voxels.occupied[:] = True
+
+
+def psnr(first, second) -> float:
+    """In dB, of pictures in [0, 1]."""
+    error = float((torch.as_tensor(first) - torch.as_tensor(second)).square().mean())
+    return math.inf if error == 0 else -10.0 * math.log10(error)
+
+
+KINDS = ("ndc", "box", "contracted")

@@ -1,0 +1,110 @@
+"""Voxels stand for the fields wherever a page's camera may look."""
+
+import math
+
+import pytest
+import torch
+from small_scenes import KINDS, NUM_STEPS, balls, psnr, scene
+
+from sparsestyle_ns.evaluation.held_out import rendered
+from sparsestyle_ns.export.command import load_scene, median_depth, page_picture
+from sparsestyle_ns.export.orbit import make_orbit, survey, turned
+from sparsestyle_ns.export.voxels import Voxels, bake_voxels, interpolate, last_step_cells, render_voxels
+from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT
+
+
+def test_interpolation_is_exact_for_what_is_linear():
+    axis = torch.arange(5)
+    x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
+    codes = torch.stack([10 + x, 20 + 3 * y, 5 * z, x + y + z], dim=-1).to(torch.uint8)
+    voxels = Voxels(codes, torch.ones(5, 5, 5, dtype=torch.bool), torch.ones(2, 2, 2, dtype=torch.bool))
+    points = 2.0 * torch.rand(100, 3, generator=torch.Generator().manual_seed(0)) - 1.0
+    x, y, z = (2.0 * points + 2.0).unbind(-1)
+    torch.testing.assert_close(interpolate(voxels, points), torch.stack([10 + x, 20 + 3 * y, 5 * z, x + y + z], dim=-1))
+    corner = torch.tensor([[1.5, 1.0, -3.0]])
+    torch.testing.assert_close(interpolate(voxels, corner), codes[4, 4, 0].float()[None])
+
+
+def test_a_ray_through_voxels_is_the_sum_over_its_samples():
+    """Volume rendering in one loop, as it is written in books."""
+    small = scene("box")
+    camera = small.cameras[:1]
+    picture = page_picture(small.voxels, small.model, camera)
+    for row, column in ((24, 30), (20, 40), (30, 18)):
+        coords = torch.tensor([row + 0.5, column + 0.5])
+        bundle = camera.generate_rays(camera_indices=0, coords=coords)
+        segments = small.model.space.segments(bundle.origins.view(1, 3), bundle.directions.view(1, 3))
+        color, light = torch.zeros(3), 1.0
+        for step in range(NUM_STEPS):
+            position = segments.positions(torch.tensor([[(step + 0.5) / NUM_STEPS]]))[0]
+            cell = tuple(((0.5 * position[0] + 0.5) * 12).long().clamp(0, 11).tolist())
+            if not small.voxels.occupied[cell]:
+                continue
+            code, *shade = interpolate(small.voxels, position)[0].tolist()
+            density = DENSITY_UNIT * math.expm1(DENSITY_STEP * (code - 1)) if code > 1.05 else 0.0
+            alpha = 1 - math.exp(-density * float(segments.extent.norm()) / NUM_STEPS)
+            color, light = color + light * alpha * torch.tensor(shade) / 255, light * (1 - alpha)
+        torch.testing.assert_close(picture[row, column], color + light * small.model.background, atol=1e-4, rtol=0)
+
+
+def test_a_ray_that_misses_the_scene_sees_the_background():
+    small = scene("box")
+    segments = small.model.space.segments(torch.tensor([[5.0, 5.0, 5.0]]), torch.tensor([[0.0, 0.0, 1.0]]))
+    seen = render_voxels(small.voxels, segments, NUM_STEPS, False, small.model.background)
+    torch.testing.assert_close(seen, small.model.background[None])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cells_of_the_last_step_are_known(kind):
+    small = scene(kind)
+    small.model.device = torch.device("cpu")
+    cells = last_step_cells(small.model, 61)
+    if kind == "box":
+        assert not cells.any()
+        return
+    bundle = small.cameras.generate_rays(camera_indices=torch.arange(3)[:, None]).flatten()
+    segments = small.model.space.segments(bundle.origins, bundle.directions)
+    last = segments.positions(torch.full((len(bundle), 1), 1.0 - 0.5 / NUM_STEPS))[:, 0]
+    index = ((0.5 * last + 0.5) * 61).long().clamp(0, 60)
+    assert cells[tuple(index.unbind(-1))].all()
+    assert cells.float().mean() < 0.2
+
+
+def test_fog_outside_of_what_is_occupied_counts_only_in_the_last_step():
+    small = scene("ndc")
+    empty = Voxels(small.voxels.codes, small.voxels.known, torch.zeros_like(small.voxels.occupied))
+    before = page_picture(empty, small.model, small.cameras[:1])
+    assert torch.equal(before, torch.zeros_like(before))
+    foggy = balls(31, 12)
+    foggy.codes[..., -1, :] = torch.tensor([60, 0, 255, 0], dtype=torch.uint8)
+    after = page_picture(Voxels(foggy.codes, foggy.known, empty.occupied), small.model, small.cameras[:1])
+    assert after[..., 1].mean() > 0.5
+
+
+@pytest.fixture(scope="module")
+def exported(patterned_run):
+    """A run, its voxels and its orbit."""
+    loaded = load_scene(patterned_run / "config.yml")
+    exact = rendered(loaded.model, loaded.cameras[1:2], "exact")
+    orbit = make_orbit(loaded.model.space, loaded.cameras, 1, median_depth(exact))
+    return loaded, bake_voxels(loaded.model, 95, survey(orbit, loaded.cameras)), orbit
+
+
+def test_turned_views_that_no_photo_shows_are_there_as_well(exported):
+    loaded, voxels, orbit = exported
+    # Not so far that rays leave the cube, where voxels repeat its border and the fields go on somehow.
+    for yaw, pitch in ((4.0, -3.0), (-5.0, 2.0)):
+        camera = turned(orbit, loaded.cameras, yaw, pitch)
+        exact = rendered(loaded.model, camera, "exact")["rgb"]
+        assert psnr(page_picture(voxels, loaded.model, camera), exact) > 33
+
+
+def test_voxels_hold_the_fields_values(exported):
+    loaded, voxels, _ = exported
+    index = voxels.known.nonzero()[::97]
+    shade = loaded.model.bake(8).shade(index.float() * (2.0 / 95) - 1.0)
+    density = DENSITY_UNIT * torch.expm1(DENSITY_STEP * (voxels.codes[tuple(index.unbind(-1))][:, 0].float() - 1))
+    torch.testing.assert_close(density, shade[:, 1], rtol=0.04, atol=0.5 * DENSITY_UNIT)
+    torch.testing.assert_close(
+        voxels.codes[tuple(index.unbind(-1))][:, 1:] / 255.0, shade[:, 2:5], atol=0.6 / 255, rtol=0
+    )

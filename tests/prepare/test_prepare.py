@@ -1,0 +1,251 @@
+"""`sparsestyle prepare`: scenes that the dataparsers read, poses that still fit the photos, and clear words if not."""
+
+import json
+import os
+import stat
+import textwrap
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from photo_sets import ASIDE, FOCAL, HEIGHT, TURNED, WIDTH, photo, write_photos, write_poses_bounds, write_transforms
+from PIL import ExifTags, Image
+
+from sparsestyle_ns.cli import main
+from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
+from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.prepare.command import prepare_scene
+
+
+def parse_llff(folder):
+    return LLFFDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
+
+
+def parse_nerfstudio(folder):
+    settings = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
+    return NerfstudioDataParserConfig(data=folder, **settings).setup().get_dataparser_outputs("train")
+
+
+def install_fake(folder, name, script):
+    """A program on a PATH of its own."""
+    folder.mkdir(exist_ok=True)
+    path = folder / name
+    path.write_text(script)
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+
+
+@pytest.fixture
+def no_colmap(tmp_path, monkeypatch):
+    (tmp_path / "bin").mkdir()
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+
+
+@pytest.fixture
+def colmap(tmp_path, monkeypatch):
+    """A colmap, and an ns-process-data that places the photos `PLACED` and notes what it was called with."""
+    install_fake(tmp_path / "bin", "colmap", "#!/bin/sh\n")
+    install_fake(tmp_path / "bin", "ffmpeg", "#!/bin/sh\n")
+    script = """\
+        #!/usr/bin/env python3
+        import json, os, pathlib, shutil, sys
+        arguments = sys.argv[1:]
+        data, output = (pathlib.Path(arguments[arguments.index(flag) + 1]) for flag in ("--data", "--output-dir"))
+        pathlib.Path(os.environ["NOTES"]).write_text(json.dumps(arguments))
+        placed = json.loads(os.environ["PLACED"])
+        if not placed:
+            sys.exit("could not find an initial pair")
+        (output / "images").mkdir()
+        frames = []
+        for number, photo in enumerate(sorted(data.iterdir()), start=1):
+            name = f"frame_{number:05d}{photo.suffix}"
+            shutil.copy(photo, output / "images" / name)
+            pose = [[1, 0, 0, number], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+            if number in placed:
+                frames.append({"file_path": f"images/{name}", "transform_matrix": pose})
+        intrinsics = {"fl_x": 272, "fl_y": 272, "cx": 160, "cy": 120, "w": 320, "h": 240}
+        (output / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
+        """
+    install_fake(tmp_path / "bin", "ns-process-data", textwrap.dedent(script))
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("NOTES", str(tmp_path / "notes.json"))
+    monkeypatch.setenv("PLACED", "[1, 2, 3]")
+    return tmp_path / "notes.json"
+
+
+@pytest.mark.parametrize("place", ["", "images"])
+def test_photos_with_poses_bounds_become_an_llff_scene(tmp_path, capsys, place):
+    photos = tmp_path / "photos"
+    write_photos(photos / place)
+    write_poses_bounds(photos)
+    main(["prepare", str(photos), "--output", str(tmp_path / "scene")])
+    outputs = parse_llff(tmp_path / "scene")
+    assert len(outputs.image_filenames) == 3
+    assert outputs.cameras.fx[0].item() == pytest.approx(FOCAL)
+    np.testing.assert_array_equal(np.asarray(Image.open(outputs.image_filenames[1])), np.asarray(photo(ASIDE[1])))
+    printed = capsys.readouterr().out
+    assert "Warning" not in printed
+    assert printed.splitlines()[-1] == f"Next: ns-train coarse-fewshot --data {tmp_path / 'scene'} llff-data"
+
+
+def test_photos_with_transforms_become_a_nerfstudio_scene(tmp_path):
+    names = write_photos(tmp_path / "photos")
+    write_transforms(tmp_path / "photos", names)
+    scene = prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    assert scene.parser == "nerfstudio-data"
+    cameras = parse_nerfstudio(tmp_path / "scene").cameras
+    assert cameras.fx.flatten().tolist() == pytest.approx([FOCAL] * 3)
+    assert (cameras.cx[0].item(), cameras.cy[0].item()) == (150.0, 130.0)
+    assert cameras.distortion_params[0, 0].item() == pytest.approx(0.01)
+
+
+def test_a_point_is_seen_at_the_same_spot_of_a_scaled_and_cropped_photo(tmp_path):
+    """Three sizes and both aspects: what a pixel shows is where the new intrinsics say."""
+    names = write_photos(tmp_path / "photos")
+    write_transforms(tmp_path / "photos", names)
+    content = json.loads((tmp_path / "photos" / "transforms.json").read_text())
+    portrait = photo(ASIDE[2]).crop((70, 0, 250, 240))  # 180 × 240: its own intrinsics have the moved centre
+    portrait.save(tmp_path / "photos" / names[2])
+    content["frames"][2].update(fl_x=FOCAL, fl_y=FOCAL, cx=80.0, cy=130.0, w=180, h=240)
+    photo(ASIDE[1]).resize((640, 480), Image.Resampling.BICUBIC).save(tmp_path / "photos" / names[1])
+    (tmp_path / "photos" / "transforms.json").write_text(json.dumps(content))
+    prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    cameras = parse_nerfstudio(tmp_path / "scene").cameras
+    # The shortest longer side is 240; 240 × 180 and 180 × 240 have 180 × 180 in common.
+    assert {(int(w), int(h)) for w, h in zip(cameras.width, cameras.height, strict=True)} == {(180, 180)}
+    assert cameras.fx.flatten().tolist() == pytest.approx([0.75 * FOCAL, 0.75 * FOCAL, FOCAL])
+    assert cameras.cx.flatten().tolist() == pytest.approx([0.75 * 150 - 30, 0.75 * 150 - 30, 80.0])
+    assert cameras.cy.flatten().tolist() == pytest.approx([0.75 * 130, 0.75 * 130, 130 - 30])
+    original = np.asarray(photo(ASIDE[1]).convert("L"), float)
+    prepared = np.asarray(Image.open(tmp_path / "scene" / "images" / "photo_001.png").convert("L"), float)
+    for x, y in ((150.0, 130.0), (100.0, 60.0), (210.0, 200.0)):
+        column = 0.75 * FOCAL * (x - 150.0) / FOCAL + cameras.cx[1].item()
+        row = 0.75 * FOCAL * (y - 130.0) / FOCAL + cameras.cy[1].item()
+        before = original[int(y) - 4 : int(y) + 4, int(x) - 4 : int(x) + 4].mean()
+        after = prepared[int(row) - 3 : int(row) + 3, int(column) - 3 : int(column) + 3].mean()
+        assert after == pytest.approx(before, abs=6)
+
+
+def test_poses_bounds_follow_the_photos_size(tmp_path):
+    names = write_photos(tmp_path / "photos")
+    write_poses_bounds(tmp_path / "photos")
+    for name in names:
+        image = Image.open(tmp_path / "photos" / name)
+        image.resize((160, 120)).save(tmp_path / "photos" / name)
+    prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    cameras = parse_llff(tmp_path / "scene").cameras
+    assert (int(cameras.width[0]), cameras.fx[0].item()) == (160, pytest.approx(FOCAL / 2))
+
+
+def test_a_photo_stays_as_stored_where_only_that_fits_its_pose(tmp_path, capsys):
+    names = write_photos(tmp_path / "photos")
+    write_poses_bounds(tmp_path / "photos")
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    photo(ASIDE[0]).save(tmp_path / "photos" / names[0], exif=exif)
+    prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    assert "a.png stays as it is stored" in capsys.readouterr().out
+    assert Image.open(tmp_path / "scene" / "images" / "photo_000.png").size == (WIDTH, HEIGHT)
+
+
+def test_without_poses_and_colmap_one_sentence_names_the_ways_out(tmp_path, no_colmap, capsys):
+    write_photos(tmp_path / "photos")
+    with pytest.raises(SystemExit) as ended:
+        main(["prepare", str(tmp_path / "photos"), "--output", str(tmp_path / "scene")])
+    for way in ("COLMAP", "apt install colmap", "poses_bounds.npy", "transforms.json"):
+        assert way in ended.value.code
+    assert "\n" not in ended.value.code
+    assert not (tmp_path / "scene").exists()
+
+
+def test_what_is_wrong_with_the_photos_is_said_before_colmap_is_missed(tmp_path, no_colmap, capsys):
+    write_photos(tmp_path / "photos", TURNED)
+    with pytest.raises(InputError, match="COLMAP"):
+        prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    assert "Warning: The camera turned without moving" in capsys.readouterr().out
+
+
+def test_colmap_gets_upright_photos_of_one_size(tmp_path, colmap, capsys):
+    write_photos(tmp_path / "photos", suffix=".jpg")
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    photo(ASIDE[0]).rotate(90, expand=True).resize((480, 640)).save(tmp_path / "photos" / "a.jpg", exif=exif)
+    main(["prepare", str(tmp_path / "photos"), "--output", str(tmp_path / "scene")])
+    assert capsys.readouterr().out.splitlines()[-1].endswith("nerfstudio-data")
+    arguments = json.loads(colmap.read_text())
+    assert arguments[0] == "images"
+    assert arguments[arguments.index("--matching-method") + 1] == "exhaustive"
+    assert ("--gpu" in arguments) == torch.cuda.is_available()
+    outputs = parse_nerfstudio(tmp_path / "scene")
+    assert [Image.open(path).size for path in outputs.image_filenames] == [(WIDTH, HEIGHT)] * 3
+
+
+def test_photos_that_colmap_could_not_place_are_named(tmp_path, colmap, monkeypatch, capsys):
+    write_photos(tmp_path / "photos", [*ASIDE, TURNED[0]])
+    monkeypatch.setenv("PLACED", "[1, 3, 4]")
+    scene = prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    assert len(scene.names) == 3
+    assert "COLMAP couldn't tell where b.png was taken" in capsys.readouterr().out
+
+
+def test_where_colmap_fails_the_photos_faults_are_the_answer(tmp_path, colmap, monkeypatch):
+    write_photos(tmp_path / "photos", TURNED)
+    monkeypatch.setenv("PLACED", "[]")
+    with pytest.raises(InputError, match=r"0 of 3 photos.*initial pair.*The camera turned without moving"):
+        prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+
+
+def test_poses_may_be_asked_of_colmap_though_a_file_has_some(tmp_path, colmap):
+    write_photos(tmp_path / "photos")
+    write_poses_bounds(tmp_path / "photos")
+    assert prepare_scene(tmp_path / "photos", tmp_path / "scene", "colmap").parser == "nerfstudio-data"
+    assert colmap.exists()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (lambda photos: (photos / "a.png").unlink(), "2 photos"),
+        (lambda photos: photo(ASIDE[0]).save(photos / "d.png"), "4 photos, but .* has 3 poses"),
+        (lambda photos: photo(ASIDE[0]).crop((0, 0, 240, 240)).save(photos / "b.png"), "b.png is 240 × 240 pixels"),
+        (lambda photos: (photos / "poses_bounds.npy").write_bytes(b"nothing"), "cannot be read as an array"),
+    ],
+)
+def test_photos_and_poses_that_do_not_fit_are_refused(tmp_path, spoil, sentence):
+    write_photos(tmp_path / "photos")
+    write_poses_bounds(tmp_path / "photos")
+    spoil(tmp_path / "photos")
+    with pytest.raises(InputError, match=sentence):
+        prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+
+
+def test_transforms_of_other_photos_or_without_focal_length_are_refused(tmp_path):
+    photos = tmp_path / "photos"
+    write_photos(photos)
+    write_transforms(photos, ["x.png", "y.png", "z.png"])
+    with pytest.raises(InputError, match="has poses for 0 of the 3 photos"):
+        prepare_scene(photos, tmp_path / "scene")
+    (photos / "transforms.json").write_text('{"frames": [{"file_path": "a.png"}]}')
+    with pytest.raises(InputError, match="no focal length"):
+        prepare_scene(photos, tmp_path / "scene")
+    (photos / "transforms.json").write_text("[]")
+    with pytest.raises(InputError, match="is not nerfstudio's"):
+        prepare_scene(photos, tmp_path / "scene")
+
+
+def test_a_folder_with_something_in_it_is_left_alone(tmp_path):
+    write_photos(tmp_path / "photos")
+    write_poses_bounds(tmp_path / "photos")
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="is there already"):
+        prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    assert [path.name for path in (tmp_path / "scene").iterdir()] == ["mine.txt"]
+
+
+def test_poses_are_asked_of_a_file_that_is_not_there(tmp_path):
+    write_photos(tmp_path / "photos")
+    with pytest.raises(InputError, match=r"Neither poses_bounds.npy nor transforms.json"):
+        prepare_scene(tmp_path / "photos", tmp_path / "scene", "file")
