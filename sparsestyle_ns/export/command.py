@@ -12,7 +12,7 @@ from nerfstudio.cameras.cameras import Cameras
 from rich.progress import track
 from torch import Tensor
 
-from sparsestyle_ns.evaluation.held_out import rendered
+from sparsestyle_ns.evaluation.held_out import exact_outputs
 from sparsestyle_ns.evaluation.image_metrics import psnr
 from sparsestyle_ns.export.orbit import make_orbit, most_central, pinholes, resized, survey
 from sparsestyle_ns.export.page import build_page, fit_page
@@ -77,7 +77,7 @@ def exact_pictures(scene: StylisedScene, longest: Optional[int]) -> List[Dict[st
     for index in track(range(len(scene.cameras)), description="Exact renders"):
         camera = scene.cameras[index : index + 1]
         camera = (camera if longest is None else resized(camera, longest)).to(scene.model.device)
-        pictures.append({key: value.cpu() for key, value in rendered(scene.model, camera, "exact").items()})
+        pictures.append({key: value.cpu() for key, value in exact_outputs(scene.model, camera).items()})
     return pictures
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from small_scenes import KINDS, NUM_STEPS, balls, psnr, scene
 
-from sparsestyle_ns.evaluation.held_out import rendered
+from sparsestyle_ns.evaluation.held_out import exact_outputs
 from sparsestyle_ns.export.command import load_scene, median_depth, page_picture
 from sparsestyle_ns.export.orbit import make_orbit, survey, turned
 from sparsestyle_ns.export.voxels import Voxels, bake_voxels, interpolate, last_step_cells, render_voxels
@@ -85,7 +85,7 @@ def test_fog_outside_of_what_is_occupied_counts_only_in_the_last_step():
 def exported(patterned_run):
     """A run, its voxels and its orbit."""
     loaded = load_scene(patterned_run / "config.yml")
-    exact = rendered(loaded.model, loaded.cameras[1:2], "exact")
+    exact = exact_outputs(loaded.model, loaded.cameras[1:2])
     orbit = make_orbit(loaded.model.space, loaded.cameras, 1, median_depth(exact))
     return loaded, bake_voxels(loaded.model, 95, survey(orbit, loaded.cameras)), orbit
 
@@ -95,7 +95,7 @@ def test_turned_views_that_no_photo_shows_are_there_as_well(exported):
     # Not so far that rays leave the cube, where voxels repeat its border and the fields go on somehow.
     for yaw, pitch in ((4.0, -3.0), (-5.0, 2.0)):
         camera = turned(orbit, loaded.cameras, yaw, pitch)
-        exact = rendered(loaded.model, camera, "exact")["rgb"]
+        exact = exact_outputs(loaded.model, camera)["rgb"]
         assert psnr(page_picture(voxels, loaded.model, camera), exact) > 33
 
 
