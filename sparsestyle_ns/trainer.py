@@ -31,6 +31,7 @@ from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.errors import InputError, exit_on_input_error
 from sparsestyle_ns.files import write_whole
 from sparsestyle_ns.finite_steps import FiniteOptimizers
+from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
 from sparsestyle_ns.processes import any_process, from_first_process, prepare_launch, share_state
 from sparsestyle_ns.scene_record import record_scene
 from sparsestyle_ns.style.image import load_style_image
@@ -377,8 +378,14 @@ class HierStyleTrainer(SparseStyleTrainer):
         config.save_config()
 
     def notes(self) -> Dict[str, Any]:
-        """Which feature network stylised the scene, and where its weights came from."""
-        return {**super().notes(), "backbone": asdict(self.pipeline.targets.backbone.description)}
+        """Which feature network stylised the scene, where its weights came from, and which coarse run it builds on."""
+        pipeline = self.config.pipeline
+        return {
+            **super().notes(),
+            "backbone": asdict(self.pipeline.targets.backbone.description),
+            "coarse_run": str(pipeline.coarse_run),
+            "coarse_field": asdict(pipeline.model.coarse_field),
+        }
 
     def _load_checkpoint(self) -> None:
         super()._load_checkpoint()
@@ -388,11 +395,11 @@ class HierStyleTrainer(SparseStyleTrainer):
 
     def _adopt_shape_of_checkpoint(self) -> None:
         """Takes the coarse field's settings from the run that is resumed; they came from its coarse run."""
-        path = self.resumed_checkpoint().parent.parent / "config.yml"
-        if path.is_file():
-            saved = yaml.load(path.read_text(), Loader=yaml.Loader)
-            self.config.pipeline.model.coarse_field = saved.pipeline.model.coarse_field
-            self.config.pipeline.coarse_run = saved.pipeline.coarse_run
+        # Its config.yml may be this command's own by now, where training goes on in the same folder.
+        state = load_checkpoint(self.resumed_checkpoint())
+        if "coarse_field" in state:  # a coarse run's has none; loading it says what is wrong
+            self.config.pipeline.model.coarse_field = CoarseFieldConfig(**state["coarse_field"])
+            self.config.pipeline.coarse_run = Path(state["coarse_run"])
 
     def coarse_run(self, manager: FewShotDataManager) -> CoarseRun:
         """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now.

@@ -73,7 +73,6 @@ def held_out_psnr(folder: Path, layout: str, steps: int, effects: Dict[str, str]
     [
         ("llff", (), {"ndc": "on"}, {"contraction": "on"}),
         ("blender", (), {"box": "on"}, {"contraction": "on"}),
-        ("nerfstudio", (), {"contraction": "on"}, {"box": "on"}),
         ("blender", (), {"background": "on"}, {"background": "off"}),
         ("llff", ("--shiny", "0.8"), {"view_color": "on"}, {"view_color": "off"}),
         ("llff", ("--exposure", "0.7"), {"exposure": "on"}, {"exposure": "off"}),
