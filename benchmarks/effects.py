@@ -42,6 +42,7 @@ STAGE_1: Dict[str, Tuple[str, Tuple[str, ...], Dict[str, str], Dict[str, str]]] 
     "background": ("blender", (), {"background": "on"}, {"background": "off"}),
     "view_color": ("llff", ("--shiny", "0.8"), {"view_color": "on"}, {"view_color": "off"}),
     "exposure": ("llff", ("--exposure", "0.5"), {"exposure": "on"}, {"exposure": "off"}),
+    "matched_depth": ("llff", (), {"matched_depth": "on"}, {"matched_depth": "off"}),
     "empty_space": ("llff", (), {"empty_space": "on"}, {"empty_space": "off"}),
 }
 """By effect: the layout and options of the scene, and the settings with it and without."""

@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Dict, Optional, Tuple, Type, Union
 
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from sparsestyle_ns.dataparsers.transforms import check_transforms
 from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.matched_depth import MatchedRays
 from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings, decide
 from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.errors import InputError
@@ -40,6 +42,8 @@ class FewShotDataManagerConfig(VanillaDataManagerConfig):
     transforms_train.json for Blender."""
     max_image_side: Annotated[Optional[int], tyro.conf.arg(aliases=("--max-image-side",))] = 1008
     """Photos whose longer side is over this many pixels are reduced to it."""
+    matched_share: float = 0.25
+    """Rays to matched points in a batch, over its other rays; none where `matched_depth` is off (see Effects)."""
     seed: int = 42
     """Seed of the choice of pixels; a step's batch depends on it and the step alone, so a resumed run sees the same."""
     effects: tyro.conf.Suppress[EffectSettings] = ALL_AUTO
@@ -141,14 +145,33 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         """Loads the photos and generates all their rays once."""
         self.pixels = gather_pixels(self.train_dataset, self.device)
 
+    @functools.cached_property
+    def matched(self) -> Optional[MatchedRays]:
+        """Rays to points of known depth; None where the effect is off. Found when training begins."""
+        rays = self.effects.build("matched_depth", scene=self.scene)
+        return None if rays is None else MatchedRays(**{key: part.to(self.device) for key, part in vars(rays).items()})
+
     def next_train(self, step: int) -> Tuple[RayBundle, Dict[str, Any]]:
-        """A batch of random pixels of all training views; the same for the same seed and step."""
+        """A batch of random pixels of all training views; the same for the same seed and step.
+
+        Where points are matched, rays to some of them come last. They have no colour, but their distance is in the
+        bundle's metadata as `matched_distance`, which is 0 for the others.
+        """
         self.train_count += 1
         generator = torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + step)
         count = self.config.train_num_rays_per_batch
         pick = torch.randint(len(self.pixels.trusted), (count,), generator=generator, device=self.device)
-        rows = self.pixels.trusted[pick]
-        return bundle_rays(self.pixels, rows), {"image": self.pixels.colors[rows]}
+        pixels, matched, metadata = self.pixels, self.matched, {}
+        chosen = pixels.trusted[pick]
+        rays = pixels.origins[chosen], pixels.directions[chosen], pixels.views[chosen]
+        if matched is not None:
+            extra = math.ceil(self.config.matched_share * count)
+            pick = torch.randint(len(matched), (extra,), generator=generator, device=self.device)
+            known = matched.origins[pick], matched.directions[pick], matched.views[pick]
+            rays = tuple(map(torch.cat, zip(rays, known, strict=True)))
+            distances = matched.distances[pick]
+            metadata["matched_distance"] = torch.cat([distances.new_zeros(count, 1), distances])
+        return bundle_rays(*rays, metadata), {"image": pixels.colors[chosen]}
 
     def get_train_rays_per_batch(self) -> int:
         """Rays of a batch that this process renders."""
@@ -247,11 +270,17 @@ def gather_pixels(dataset: InputDataset, device: Union[str, torch.device]) -> Tr
     )
 
 
-def bundle_rays(pixels: TrainingPixels, rows: Int[Tensor, "rays"]) -> RayBundle:
-    """A nerfstudio ray bundle of some of the pixels."""
+def bundle_rays(
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    views: Int[Tensor, "rays"],
+    metadata: Dict[str, Float[Tensor, "rays _"]],
+) -> RayBundle:
+    """A nerfstudio ray bundle of world rays and the training views that they belong to."""
     return RayBundle(
-        origins=pixels.origins[rows],
-        directions=pixels.directions[rows],
-        pixel_area=torch.ones_like(pixels.origins[rows][:, :1]),
-        camera_indices=pixels.views[rows][:, None],
+        origins=origins,
+        directions=directions,
+        pixel_area=torch.ones_like(origins[:, :1]),
+        camera_indices=views[:, None],
+        metadata=metadata,
     )

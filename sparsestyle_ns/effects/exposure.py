@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from sparsestyle_ns.effects.base import Effect, Measurement
-from sparsestyle_ns.effects.matches import ColorMatches
+from sparsestyle_ns.effects.matches import PointMatches
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_STOPS = 0.1
@@ -21,7 +21,7 @@ ROBUST = 0.02
 """Log ratio below which differences count by their square, above by their size."""
 
 
-def fit_gains(matches: ColorMatches) -> Tuple[Float[np.ndarray, "views 3"], Float[np.ndarray, "matches 3"]]:
+def fit_gains(matches: PointMatches) -> Tuple[Float[np.ndarray, "views 3"], Float[np.ndarray, "matches 3"]]:
     """Each photo's log gain, and what of the colours' log ratios it doesn't explain.
 
     The gains minimise the sum of absolute differences (iteratively reweighted least squares), with a mean of zero over

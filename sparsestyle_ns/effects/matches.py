@@ -1,4 +1,4 @@
-"""Colours of the same surface points in different photos, found by matching and checked against the cameras.
+"""The same surface points in different photos, found by matching and checked against the cameras.
 
 SIFT keypoints are matched in both directions with Lowe's ratio test; a match counts where it obeys the epipolar
 geometry of the two known cameras within a pixel. Colours are those of blurred photos, so that a match that is off by a
@@ -26,12 +26,13 @@ NEAREST_VIEWS = 6
 
 
 @dataclass
-class ColorMatches:
+class PointMatches:
     """Points seen in two photos.
 
     Attributes:
         first, second: which photos.
         colors_first, colors_second: RGB there, in [0, 1].
+        directions_first, directions_second: unit vectors in the world, from the cameras to the point.
         num_views: photos in all.
     """
 
@@ -39,6 +40,8 @@ class ColorMatches:
     second: Int[np.ndarray, "matches"]
     colors_first: Float[np.ndarray, "matches 3"]
     colors_second: Float[np.ndarray, "matches 3"]
+    directions_first: Float[np.ndarray, "matches 3"]
+    directions_second: Float[np.ndarray, "matches 3"]
     num_views: int
 
     def __len__(self) -> int:
@@ -63,8 +66,8 @@ class _Keypoints:
     scale: float
 
 
-def match_colors(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras) -> ColorMatches:
-    """Finds points that two photos see, and their colours; only where both photos are opaque.
+def match_points(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras) -> PointMatches:
+    """Finds points that two photos see; only where both photos are opaque.
 
     Args:
         photos: RGBA in [0, 1].
@@ -83,12 +86,43 @@ def match_colors(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras)
         fits = error < MAX_EPIPOLAR_ERROR * max(one.scale, other.scale)
         here, there = here[fits], there[fits]
         colors = sample(blurred[first], one.points[here]), sample(blurred[second], other.points[there])
+        directions = in_world(one.rays[here], poses[first]), in_world(other.rays[there], poses[second])
         opaque = (colors[0][:, 3] > 0.99) & (colors[1][:, 3] > 0.99)
-        count = int(opaque.sum())
-        found.append((np.full(count, first), np.full(count, second), *(each[opaque, :3] for each in colors)))
-    empty = (np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)))
+        views = np.full(len(here), first), np.full(len(here), second)
+        found.append((*(each[opaque] for each in views), *(each[opaque, :3] for each in (*colors, *directions))))
+    empty = (np.zeros(0, int), np.zeros(0, int), *(np.zeros((0, 3)) for _ in range(4)))
     columns = [np.concatenate(parts) for parts in zip(empty, *found, strict=True)]
-    return ColorMatches(*columns, num_views=len(photos))
+    return PointMatches(*columns, num_views=len(photos))
+
+
+def in_world(rays: Float[np.ndarray, "points 3"], pose: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "points 3"]:
+    """Unit directions in the world, of directions in a camera."""
+    directions = rays @ pose[:, :3].T
+    return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+def distances_along(
+    origins_first: Float[np.ndarray, "rays 3"],
+    directions_first: Float[np.ndarray, "rays 3"],
+    origins_second: Float[np.ndarray, "rays 3"],
+    directions_second: Float[np.ndarray, "rays 3"],
+) -> Tuple[Float[np.ndarray, "rays"], Float[np.ndarray, "rays"]]:
+    """Where two rays of unit direction come nearest to each other: the distance from either's origin.
+
+    Infinite where they are parallel; negative where they come nearest behind an origin.
+    """
+    between = origins_first - origins_second
+    cosine = (directions_first * directions_second).sum(axis=-1)
+    # 1 − cos² without its cancellation for rays that are nearly parallel.
+    square_of_sine = (np.cross(directions_first, directions_second) ** 2).sum(axis=-1)
+    along_first, along_second = (
+        (direction * between).sum(axis=-1) for direction in (directions_first, directions_second)
+    )
+    parallel = square_of_sine < 1e-12
+    safe = np.where(parallel, 1.0, square_of_sine)
+    first = np.where(parallel, np.inf, (cosine * along_second - along_first) / safe)
+    second = np.where(parallel, np.inf, (along_second - cosine * along_first) / safe)
+    return first, second
 
 
 def neighbouring_pairs(poses: Float[np.ndarray, "views 3 4"]) -> List[Tuple[int, int]]:

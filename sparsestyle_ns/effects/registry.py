@@ -11,6 +11,7 @@ from sparsestyle_ns.effects.empty_space import EmptySpace
 from sparsestyle_ns.effects.exposure import Exposure
 from sparsestyle_ns.effects.layouts import BoundedBox, Contraction, ForwardFacing
 from sparsestyle_ns.effects.lens_distortion import LensDistortion
+from sparsestyle_ns.effects.matched_depth import MatchedDepth
 from sparsestyle_ns.effects.palette import Palette
 from sparsestyle_ns.effects.residual_density import ResidualDensity
 from sparsestyle_ns.effects.scene import Scene
@@ -27,6 +28,7 @@ EFFECTS: Dict[str, Effect] = {
         ViewColor(),
         Exposure(),
         LensDistortion(),
+        MatchedDepth(),
         EmptySpace(),
         ResidualDensity(),
         Palette(),

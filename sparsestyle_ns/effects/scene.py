@@ -16,7 +16,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from PIL import Image
 from torch import Tensor
 
-from sparsestyle_ns.effects.matches import ColorMatches, match_colors
+from sparsestyle_ns.effects.matches import PointMatches, match_points
 from sparsestyle_ns.photos import open_photo
 from sparsestyle_ns.view_selection import evenly_spaced
 
@@ -104,10 +104,15 @@ class Scene:
         return np.median(np.concatenate([border(photo)[:, :3] for photo in self.photos]), axis=0).tolist()
 
     @cached_property
-    def matches(self) -> ColorMatches:
-        """Points that are seen in two photos, with their colours there; of at most `MATCHED_VIEWS`, evenly spaced."""
-        chosen = evenly_spaced(self.num_views, MATCHED_VIEWS)
-        return match_colors([self.photos[index] for index in chosen], self.cameras[torch.tensor(chosen)])
+    def matches(self) -> PointMatches:
+        """Points that are seen in two of `matched_views`, which are what it numbers the photos by."""
+        chosen = self.matched_views
+        return match_points([self.photos[index] for index in chosen], self.cameras[torch.tensor(chosen)])
+
+    @property
+    def matched_views(self) -> List[int]:
+        """Photos among which points are matched: at most `MATCHED_VIEWS`, evenly spaced."""
+        return list(evenly_spaced(self.num_views, MATCHED_VIEWS))
 
 
 def read_rgba(path: Path) -> Float[np.ndarray, "H W 4"]:

@@ -15,7 +15,7 @@ from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.field_components.positional_encoding import revealed_levels
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
 from sparsestyle_ns.fields.coarse import CoarseField, DensityActivation
-from sparsestyle_ns.losses.geometry import near_density
+from sparsestyle_ns.losses.geometry import matched_depth_loss, near_density
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.processes import num_processes, own_share, put_together
 from sparsestyle_ns.rendering.compositing import distortion, effective_samples
@@ -80,6 +80,8 @@ class CoarseFewShotModelConfig(ModelConfig):
     """Share of the iterations after which the distortion loss sets in."""
     distortion_ramp: float = 0.3
     """Share of the iterations in which it then grows to its weight; 0 is at once."""
+    matched_depth_weight: float = 0.05
+    """Weight of the distance between matched points and where their rays end, where `matched_depth` is on."""
     occlusion_weight: float = 0.0
     """Weight of density close to the camera (FreeNeRF's occlusion loss); 0 is off."""
     occlusion_range: float = 0.1
@@ -173,9 +175,8 @@ class CoarseFewShotModel(Model):
         edges = self.place_samples(segments, num_samples, None)
         return self.render(segments, ray_bundle.directions, edges), segments
 
-    def render_batch(self, origins: Tensor, directions: Tensor) -> Tuple[DenseRender, Tensor]:
+    def render_batch(self, segments: Segments, origins: Tensor, directions: Tensor) -> Tuple[DenseRender, Tensor]:
         """Renders the rays of a training step, each process its share; also returns the samples' borders."""
-        segments = self.space.segments(origins, directions)
         generator = self._generator()
         edges = self.place_samples(segments, self.config.num_samples, generator)
         thinning = Thinning(self.config.thinning, generator) if self.config.thinning > 0 else None
@@ -191,14 +192,16 @@ class CoarseFewShotModel(Model):
             render, segments = self.render_rays(ray_bundle, self.config.num_eval_samples)
             depth = segments.distance(render.s.clamp(max=1.0 - 1e-4))
             return {"rgb": render.rgb, "accumulation": render.accumulation, "depth": depth}
-        render, edges = self.render_batch(ray_bundle.origins, ray_bundle.directions)
+        segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
+        render, edges = self.render_batch(segments, ray_bundle.origins, ray_bundle.directions)
         if self.grid is not None:
             self.grid.remember(render.positions, render.density)
         rgb = render.rgb
         if self.exposure is not None:
             behind = seen_behind(render.accumulation, self.background)
             rgb = self.exposure(rgb, behind, ray_bundle.camera_indices.squeeze(-1))
-        return {
+        known = ray_bundle.metadata.get("matched_distance")
+        return ({} if known is None else {"matched_s": segments.at_distance(known)}) | {
             "rgb": rgb,
             "accumulation": render.accumulation,
             "edges": edges,
@@ -208,7 +211,8 @@ class CoarseFewShotModel(Model):
 
     def get_metrics_dict(self, outputs: Dict[str, Tensor], batch: Dict[str, Any]) -> Dict[str, Tensor]:
         """PSNR of the batch, in dB, and effective samples a ray."""
-        error = reconstruction_loss(outputs["rgb"].detach(), batch["image"].to(self.device))
+        photo = batch["image"].to(self.device)
+        error = reconstruction_loss(outputs["rgb"][: len(photo)].detach(), photo)
         metrics = {"psnr": -10.0 * torch.log10(error)}
         if "weights" in outputs:
             metrics["effective_samples"] = effective_samples(outputs["weights"].detach()).mean()
@@ -217,14 +221,23 @@ class CoarseFewShotModel(Model):
     def get_loss_dict(
         self, outputs: Dict[str, Tensor], batch: Dict[str, Any], metrics_dict: Optional[Dict[str, Tensor]] = None
     ) -> Dict[str, Tensor]:
-        """The reconstruction loss (Eq. 4) and, in training, the regularisers that are on."""
-        losses = {"reconstruction_loss": reconstruction_loss(outputs["rgb"], batch["image"].to(self.device))}
+        """The reconstruction loss (Eq. 4) and, in training, the regularisers that are on.
+
+        The last rays of a training batch may lead to matched points; these have a depth and no colour.
+        """
+        photo = batch["image"].to(self.device)
+        losses = {"reconstruction_loss": reconstruction_loss(outputs["rgb"][: len(photo)], photo)}
         if not self.training:
             return losses
         config = self.config
         if config.distortion_weight > 0:
             weight = config.distortion_weight * self._distortion_share()
             losses["distortion_loss"] = weight * distortion(outputs["weights"], outputs["edges"]).mean()
+        if "matched_s" in outputs:
+            rows = slice(len(photo), None)
+            losses["matched_depth_loss"] = config.matched_depth_weight * matched_depth_loss(
+                outputs["weights"][rows], outputs["edges"][rows], outputs["matched_s"][rows]
+            )
         if config.occlusion_weight > 0:
             losses["occlusion_loss"] = config.occlusion_weight * near_density(
                 outputs["density"], outputs["edges"], config.occlusion_range

@@ -116,6 +116,26 @@ def ndc_distance(
     return torch.where(infinite, max_distance, distance.clamp(max=max_distance))
 
 
+def ndc_parameter(
+    distance: Float[Tensor, "*#batch 1"],
+    origins: Float[Tensor, "*#batch 3"],
+    directions: Float[Tensor, "*#batch 3"],
+    near: float = 1.0,
+) -> Float[Tensor, "*batch 1"]:
+    """t' of the point at a distance along a world ray: the inverse of `ndc_distance`, t' = 1 + n/z.
+
+    Args:
+        distance: from the ray's own origin, in units of the direction's length.
+        origins, directions, near: as given to `ndc_distance`.
+
+    Returns:
+        t', below 0 before the near plane and at most 1. A point on or behind the camera plane counts as just before it.
+    """
+    _, forward_z, _ = _forward(directions)
+    z = origins[..., 2:] + distance * forward_z
+    return 1.0 + near / z.clamp(max=-MIN_FORWARD * near)
+
+
 def _forward(
     directions: Float[Tensor, "*batch 3"],
 ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch 1"], Bool[Tensor, "*batch 1"]]:

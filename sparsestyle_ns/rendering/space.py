@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from nerfstudio.data.scene_box import SceneBox
 from torch import Tensor, nn
 
-from sparsestyle_ns.rendering.ndc import ndc_distance, ndc_rays
+from sparsestyle_ns.rendering.ndc import ndc_distance, ndc_parameter, ndc_rays
 
 MAX_DISTANCE = 1e4
 """The distance that stands for infinity in depth maps, in units of the scene: of the near plane's distance in a
@@ -41,6 +41,10 @@ class Segments(ABC):
     @abstractmethod
     def distance(self, s: Float[Tensor, "rays 1"]) -> Float[Tensor, "rays 1"]:
         """Distance from the ray's origin in world units, at most `MAX_DISTANCE` of the scene's."""
+
+    @abstractmethod
+    def at_distance(self, distance: Float[Tensor, "rays 1"]) -> Float[Tensor, "rays 1"]:
+        """s at a distance from the ray's origin in world units: the inverse of `distance`, cut to [0, 1]."""
 
 
 @dataclass
@@ -77,6 +81,11 @@ class ForwardFacingSegments(LinearSegments):
         t_ndc = self.first + s * (self.last - self.first)
         return ndc_distance(t_ndc, self.origins, self.directions, self.near, max_distance=MAX_DISTANCE * self.near)
 
+    def at_distance(self, distance: Tensor) -> Tensor:
+        """See `Segments.at_distance`."""
+        t_ndc = ndc_parameter(distance, self.origins, self.directions, self.near)
+        return _position_between(t_ndc, self.first, self.last)
+
 
 @dataclass
 class BoxSegments(LinearSegments):
@@ -89,6 +98,10 @@ class BoxSegments(LinearSegments):
     def distance(self, s: Tensor) -> Tensor:
         """See `Segments.distance`; a ray that misses the box sees what is beyond it."""
         return torch.where(self.hit[:, None], self.near + s * (self.far - self.near), self.beyond)
+
+    def at_distance(self, distance: Tensor) -> Tensor:
+        """See `Segments.at_distance`."""
+        return _position_between(distance, self.near, self.far)
 
 
 @dataclass
@@ -109,9 +122,16 @@ class ContractedSegments(Segments):
         return self.unit * self._distance_in_units(s)
 
     def _distance_in_units(self, s: Tensor) -> Tensor:
-        start = spacing(torch.tensor(self.near))
-        end = spacing(torch.tensor(MAX_DISTANCE))
+        start, end = self._ends
         return inverse_spacing(start.to(s) + s * (end - start).to(s))
+
+    @property
+    def _ends(self) -> Tuple[Tensor, Tensor]:
+        return spacing(torch.tensor(self.near)), spacing(torch.tensor(MAX_DISTANCE))
+
+    def at_distance(self, distance: Tensor) -> Tensor:
+        """See `Segments.at_distance`."""
+        return _position_between(spacing(distance / self.unit), *(end.to(distance) for end in self._ends))
 
     def positions(self, s: Tensor, ray_indices: Optional[Tensor] = None) -> Tensor:
         """See `Segments.positions`."""
@@ -125,6 +145,12 @@ class ContractedSegments(Segments):
         """See `Segments.lengths`; chords of the bent ray."""
         points = self.positions(edges)
         return (points[:, 1:] - points[:, :-1]).norm(dim=-1)
+
+
+def _position_between(value: Tensor, first: Union[float, Tensor], last: Union[float, Tensor]) -> Tensor:
+    """Where a value lies between two, in [0, 1]; 0 where they are equal."""
+    length = torch.as_tensor(last - first).to(value)
+    return torch.where(length > 0, (value - first) / torch.where(length > 0, length, 1.0), 0.0).clamp(0.0, 1.0)
 
 
 def spacing(distance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

@@ -13,6 +13,7 @@ from torch.nn.functional import normalize
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sparsestyle_ns.datamanager import FewShotDataManagerConfig
+from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import EffectSettings
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig, CoarseFieldConfig
@@ -165,7 +166,42 @@ def test_without_lens_distortion_no_ray_is_undistorted(tmp_path: Path):
     assert off.total() < bent.total()
 
 
-@pytest.mark.parametrize("name", ["background", "exposure", "view_color", "empty_space", "palette", "lens_distortion"])
+def test_without_matched_depth_no_ray_is_trained_on_that_has_no_colour(tmp_path: Path):
+    import make_sample_scene
+
+    sizes = ["--width", "126", "--num-views", "3", "--supersample", "1"]
+    make_sample_scene.main([str(tmp_path), "--layout", "llff", *sizes])
+
+    def batch(choice: str):
+        config = FewShotDataManagerConfig(
+            data=tmp_path / "llff",
+            dataparser=LLFFDataParserConfig(),
+            effects=EffectSettings(matched_depth=choice),
+            train_num_rays_per_batch=20,
+        )
+        manager = config.setup(device="cpu", test_mode="val")
+        return manager.next_train(0)
+
+    (more_rays, same_photos), (rays, photos) = batch("on"), batch("off")
+    assert (len(rays), rays.metadata, len(photos["image"])) == (20, {}, 20)
+    assert len(more_rays) == 25 and torch.equal(more_rays.origins[:20], rays.origins)
+    assert torch.equal(same_photos["image"], photos["image"])
+    assert ((more_rays.metadata["matched_distance"] > 0).squeeze(-1) == (torch.arange(25) >= 20)).all()
+
+    def operations(bundle) -> Counter:
+        model = coarse_model("ndc")
+        model.train()
+        with Operations() as counted:
+            sum(model.get_loss_dict(model.get_outputs(bundle), photos).values()).backward()
+        return counted.counts
+
+    assert operations(rays).total() < operations(more_rays).total()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["background", "exposure", "view_color", "empty_space", "palette", "lens_distortion", "matched_depth"],
+)
 def test_what_is_off_builds_nothing_and_asks_for_nothing(name):
     decisions: Decisions = decided("box")
     assert decisions.build(name) is None

@@ -64,6 +64,7 @@ OBJECT = ("--width", "32", "--num-train", "8", "--num-val", "1", "--num-test", "
         ("view_color", ("llff", *SEEN, "--shiny", "0.8"), ("llff", *SEEN)),
         ("exposure", ("llff", *SEEN, "--exposure", "0.5"), ("llff", *SEEN)),
         ("lens_distortion", ("nerfstudio", *RING, "--distortion", "0.1"), ("nerfstudio", *RING)),
+        ("matched_depth", ("llff", *SEEN), ("blender", *OBJECT)),
     ],
 )
 def test_auto_turns_an_effect_on_for_the_scene_that_calls_for_it_and_off_for_another(made, name, calling, other):
@@ -112,6 +113,7 @@ def test_fern_is_simulated_in_ndc_without_background_shine_and_exposure(capsys):
     effects = json.loads(capsys.readouterr().out)["effects"]
     assert [effect["name"] for effect in effects if effect["on"]] == [
         "ndc",
+        "matched_depth",
         "empty_space",
         "residual_density",
         "palette",
@@ -126,7 +128,7 @@ def test_lego_is_simulated_in_a_box_before_white(capsys):
     main(["effects", "blender-data", "--data", str(DATA / "blender" / "lego"), "--json"])
     effects = {effect["name"]: effect for effect in json.loads(capsys.readouterr().out)["effects"]}
     on = {name for name, effect in effects.items() if effect["on"]}
-    assert on == {"box", "background", "empty_space", "residual_density", "palette"}
+    assert on == {"box", "background", "matched_depth", "empty_space", "residual_density", "palette"}
     assert effects["background"]["parameters"] == {"color": [1.0, 1.0, 1.0]}
 
 

@@ -5,11 +5,13 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
+from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.exposure import fit_gains
 from sparsestyle_ns.effects.layouts import meeting_point, viewing_spread
 from sparsestyle_ns.effects.lens_distortion import largest_shift
-from sparsestyle_ns.effects.matches import ColorMatches, epipolar_error, mutual_matches, sample
-from sparsestyle_ns.effects.scene import border, read_rgba
+from sparsestyle_ns.effects.matched_depth import matched_rays
+from sparsestyle_ns.effects.matches import PointMatches, distances_along, epipolar_error, mutual_matches, sample
+from sparsestyle_ns.effects.scene import Scene, border, read_rgba
 from sparsestyle_ns.errors import InputError
 
 
@@ -64,18 +66,21 @@ def test_colours_are_sampled_at_pixel_centres_and_between_them():
     assert found.tolist() == [[9.0, 90.0], [1.5, 15.0], [2.0, 20.0]]
 
 
-def colour_matches(gains, outliers: int = 0) -> ColorMatches:
+def colour_matches(gains, outliers: int = 0) -> PointMatches:
     """A hundred grey points in each pair of photos with these gains, some of them of another colour in one."""
     generator = np.random.default_rng(1)
-    views, columns = len(gains), [[], [], [], []]
+    views, columns = len(gains), [[] for _ in range(6)]
     for first in range(views):
         for second in range(first + 1, views):
             colors = generator.uniform(0.3, 0.6, (100, 3))
             other = colors * gains[second]
             other[:outliers] = generator.uniform(0, 1, (outliers, 3))
-            for column, part in zip(columns, (first, second, colors * gains[first], other), strict=True):
+            nowhere = np.zeros((100, 3))
+            for column, part in zip(
+                columns, (first, second, colors * gains[first], other, nowhere, nowhere), strict=True
+            ):
                 column.append(np.full(100, part) if np.isscalar(part) else part)
-    return ColorMatches(*(np.concatenate(column) for column in columns), num_views=views)
+    return PointMatches(*(np.concatenate(column) for column in columns), num_views=views)
 
 
 @pytest.mark.parametrize("outliers", [0, 20])
@@ -92,8 +97,42 @@ def test_photos_that_hang_together_by_nothing_have_no_measurable_gain():
     whole = colour_matches(np.ones((4, 3)))
     assert whole.fewest_in_a_view() == 300
     apart = (whole.first < 2) == (whole.second < 2)
-    parts = (getattr(whole, name)[apart] for name in ("first", "second", "colors_first", "colors_second"))
-    assert ColorMatches(*parts, num_views=4).fewest_in_a_view() == 0
+    parts = {name: part[apart] for name, part in vars(whole).items() if name != "num_views"}
+    assert PointMatches(**parts, num_views=4).fewest_in_a_view() == 0
+
+
+def test_rays_to_the_same_point_meet_at_their_distances_from_it():
+    generator = np.random.default_rng(0)
+    points = generator.uniform(-1, 1, (20, 3))
+    origins = generator.uniform(3, 5, (2, 20, 3))
+    expected = np.linalg.norm(points - origins, axis=-1)
+    directions = (points - origins) / expected[..., None]
+    assert distances_along(origins[0], directions[0], origins[1], directions[1]) == pytest.approx(expected)
+    # Turned away from each other's side, the same lines meet behind the cameras.
+    behind = distances_along(origins[0], -directions[0], origins[1], -directions[1])
+    assert behind == pytest.approx(-expected)
+
+
+def test_rays_that_pass_each_other_are_measured_where_they_come_nearest_and_parallel_ones_never():
+    origins, ahead = np.array([[0.0, 0, 0], [0, 0, 0]]), np.array([[0.0, 0, -1], [0, 0, -1]])
+    others, crossing = np.array([[-2.0, 0.5, -3], [1, 0, 0]]), np.array([[1.0, 0, 0], [0, 0, -1]])
+    first, second = distances_along(origins, ahead, others, crossing)
+    assert (first.tolist(), second.tolist()) == ([3.0, np.inf], [2.0, np.inf])
+
+
+def test_points_of_a_made_scene_are_matched_at_their_true_depth(tmp_path):
+    import make_sample_scene
+
+    make_sample_scene.main([str(tmp_path), "--layout", "llff", "--width", "200", "--num-views", "5"])
+    scene = Scene.of(LLFFDataParserConfig(data=tmp_path / "llff").setup().get_dataparser_outputs("train"))
+    rays = matched_rays(scene)
+    assert len(rays) >= 200
+    # Both rays of a point end in the same place, and nearly all between the bounds that the scene was made with.
+    ends = (rays.origins + rays.distances * rays.directions).view(2, -1, 3)
+    assert ((ends[0] - ends[1]).norm(dim=-1) < 0.01 * rays.distances[: len(ends[0]), 0]).float().mean() > 0.95
+    near, far = scene.metadata["ndc_depth_range"]
+    depth = -ends[0, :, 2]
+    assert ((depth > near) & (depth < far)).float().mean() > 0.95
 
 
 def lens(k1: float) -> Cameras:

@@ -3,18 +3,22 @@
 import copy
 import functools
 from pathlib import Path
-from typing import Dict
+from typing import Any, Dict, List, Optional, Tuple
 
 import pytest
 import torch
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
+from torch import Tensor
 
 from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.registry import EffectSettings
+from sparsestyle_ns.evaluation.held_out import evaluate_held_out
 from sparsestyle_ns.evaluation.image_metrics import psnr
+from sparsestyle_ns.evaluation.training import Training
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.style.color import color_moments, gaussian_distance
+from sparsestyle_ns.style.image import load_style_image
 
 PARSERS = {"llff": LLFFDataParserConfig, "blender": BlenderDataParserConfig, "nerfstudio": NerfstudioDataParserConfig}
 
@@ -34,37 +38,71 @@ def scenes(tmp_path_factory: pytest.TempPathFactory):
     return make
 
 
+@pytest.fixture(scope="module")
+def painting(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    import make_style_image
+
+    path = tmp_path_factory.mktemp("painting") / "painting.png"
+    make_style_image.main([str(path)])
+    return path
+
+
+def small_config(method: str, folder: Path, layout: str, steps: int, effects: Dict[str, str]) -> Any:
+    """A draft's config with a small coarse field, for all of a scene's training views."""
+    config = copy.deepcopy(method_config(method))
+    pipeline = config.pipeline
+    pipeline.effects = EffectSettings(**effects)
+    manager, field = pipeline.datamanager, pipeline.model.coarse_field
+    manager.data, manager.dataparser, manager.num_views = folder, PARSERS[layout](), 12
+    field.layer_width, field.num_layers, field.feature_dim = 64, 3, 32
+    config.max_num_iterations = steps
+    return config
+
+
+def trained(config: Any, coarse_state: Optional[Dict[str, Tensor]] = None) -> Any:
+    """The pipeline after all iterations of its config."""
+    torch.manual_seed(0)
+    training = Training(config, torch.device("cpu"), coarse_state)
+    for _ in range(config.max_num_iterations):
+        training.step()
+    training.pipeline.eval()
+    return training.pipeline
+
+
+def trained_coarse(folder: Path, layout: str, steps: int, effects: Dict[str, str]) -> Any:
+    """Stage 1, shortened."""
+    config = small_config("coarse-fewshot-draft", folder, layout, steps, effects)
+    model = config.pipeline.model
+    model.num_samples, model.num_eval_samples, model.grid_resolution = 16, 32, 32
+    config.optimizers["fields"]["optimizer"].lr, config.optimizers["fields"]["scheduler"] = 5e-3, None
+    return trained(config)
+
+
+def trained_style(
+    folder: Path, layout: str, painting: Path, coarse_state: Dict[str, Tensor], steps: int, effects: Dict[str, str]
+) -> Any:
+    """Stage 2, shortened and in small."""
+    config = small_config("hier-style-draft", folder, layout, steps, effects)
+    pipeline, model = config.pipeline, config.pipeline.model
+    pipeline.style_image, pipeline.backbone, pipeline.feature_side = painting, "vgg16-shift-tolerant", 80
+    model.num_steps, model.occupancy_resolution, model.min_resolution, model.max_resolution = 32, 32, 8, 32
+    return trained(config, coarse_state)
+
+
+@torch.no_grad()
+def held_out_views(pipeline: Any) -> List[Tuple[Tensor, Tensor]]:
+    """(render, photo) of each held-out view, [H, W, 3]."""
+    dataset, views = pipeline.datamanager.eval_dataset, []
+    for index in range(len(dataset)):
+        render = pipeline.model.get_outputs_for_camera(dataset.cameras[index : index + 1])["rgb"]
+        views.append((render, dataset[index]["image"][..., :3]))
+    return views
+
+
 def held_out_psnr(folder: Path, layout: str, steps: int, effects: Dict[str, str]) -> float:
     """Mean PSNR, in dB, of the held-out views after a short training on all others."""
-    config = copy.deepcopy(method_config("coarse-fewshot-draft"))
-    pipeline_config = config.pipeline
-    pipeline_config.effects = EffectSettings(**effects)
-    manager, model = pipeline_config.datamanager, pipeline_config.model
-    manager.data, manager.dataparser, manager.num_views = folder, PARSERS[layout](), 12
-    model.num_samples, model.num_eval_samples, model.grid_resolution = 16, 32, 32
-    model.coarse_field.layer_width, model.coarse_field.num_layers, model.coarse_field.feature_dim = 64, 3, 32
-    config.max_num_iterations = steps
-    torch.manual_seed(0)
-    pipeline = pipeline_config.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
-    optimizer = torch.optim.Adam(pipeline.get_param_groups()["fields"], lr=5e-3)
-    attributes = TrainingCallbackAttributes(optimizers=None, grad_scaler=None, pipeline=pipeline, trainer=None)
-    callbacks = pipeline.get_training_callbacks(attributes)
-    pipeline.model.num_steps = steps
-    for step in range(steps):
-        pipeline.train()
-        for callback in callbacks:
-            callback.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-        _, losses, _ = pipeline.get_train_loss_dict(step)
-        optimizer.zero_grad()
-        sum(losses.values()).backward()
-        optimizer.step()
-    pipeline.eval()
-    dataset, values = pipeline.datamanager.eval_dataset, []
-    with torch.no_grad():
-        for index in range(len(dataset)):
-            picture = pipeline.model.get_outputs_for_camera(dataset.cameras[index : index + 1])["rgb"]
-            values.append(psnr(picture, dataset[index]["image"][..., :3]))
-    return sum(values) / len(values)
+    views = held_out_views(trained_coarse(folder, layout, steps, effects))
+    return sum(psnr(*view) for view in views) / len(views)
 
 
 @pytest.mark.slow
@@ -78,6 +116,7 @@ def held_out_psnr(folder: Path, layout: str, steps: int, effects: Dict[str, str]
         ("llff", ("--exposure", "0.7"), {"exposure": "on"}, {"exposure": "off"}),
         ("nerfstudio", ("--distortion", "0.4"), {"lens_distortion": "on"}, {"lens_distortion": "off"}),
         ("blender", (), {"empty_space": "on"}, {"empty_space": "off"}),
+        ("llff", ("--num-views", "4", "--width", "126"), {"matched_depth": "on"}, {"matched_depth": "off"}),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else None,
 )
@@ -85,3 +124,27 @@ def test_an_effect_that_a_scene_calls_for_makes_held_out_views_better(scenes, la
     folder = scenes(layout, *options)
     with_it, without = (held_out_psnr(folder, layout, 300, effects) for effects in (on, off))
     assert with_it > without
+
+
+@pytest.mark.slow
+def test_residual_density_lets_the_style_change_a_hazy_scene(scenes, painting):
+    folder = scenes("blender")
+    hazy = trained_coarse(folder, "blender", 60, {}).model.state_dict()
+    losses = []
+    for choice in ("on", "off"):
+        pipeline = trained_style(folder, "blender", painting, hazy, 60, {"residual_density": choice})
+        losses.append(evaluate_held_out(pipeline, pipeline.painting()).means["style_loss"])
+    assert losses[0] < 0.95 * losses[1]
+
+
+@pytest.mark.slow
+def test_palette_transfer_brings_held_out_views_to_the_colours_of_the_painting(scenes, painting):
+    folder = scenes("llff")
+    coarse = trained_coarse(folder, "llff", 150, {}).model.state_dict()
+    aim = color_moments(load_style_image(painting).flatten(1).T)
+    distances = []
+    for choice in ("on", "off"):
+        pipeline = trained_style(folder, "llff", painting, coarse, 60, {"palette": choice})
+        colors = torch.cat([render.reshape(-1, 3) for render, _ in held_out_views(pipeline)])
+        distances.append(float(gaussian_distance(*color_moments(colors), *aim)))
+    assert distances[0] < 0.9 * distances[1]

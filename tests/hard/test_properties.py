@@ -197,7 +197,7 @@ def test_borders_ascend_from_0_to_1(data, num_rays, bins, samples, jitter):
         assert (edges[:, 0] == 0).all() and (edges[:, -1] == 1).all()
 
 
-@covers(ndc.ndc_rays, ndc.ndc_points, ndc.ndc_distance)
+@covers(ndc.ndc_rays, ndc.ndc_points, ndc.ndc_distance, ndc.ndc_parameter)
 @given(st.data(), COUNTS, st.floats(1e-3, 1e3), FLOATS)
 def test_points_of_a_ray_have_their_images_on_the_rays_image(data, count, near, dtype):
     origins = data.draw(tensors((count, 3), -3, 1, signed=True, dtype=dtype)) * near
@@ -208,8 +208,10 @@ def test_points_of_a_ray_have_their_images_on_the_rays_image(data, count, near, 
     t = data.draw(tensors((count, 1), -3, 0, dtype=dtype)).clamp(max=0.9)
     distance = ndc.ndc_distance(t, origins, directions, near, max_distance=1e6 * near)
     images = ndc.ndc_points(origins + distance * directions, (1.5, 2.0), near)
-    for values in (start, extent, distance, images):
+    back = ndc.ndc_parameter(distance, origins, directions, near)
+    for values in (start, extent, distance, images, back):
         assert values.isfinite().all()
+    assert (back <= 1).all()
     (gradient,) = torch.autograd.grad(start.sum() + extent.sum() + distance.sum() + images.sum(), origins)
     assert gradient.isfinite().all()
     # Rounding of the largest coordinates of a point, seen from its depth.
@@ -533,6 +535,19 @@ def test_squared_errors_are_relative_and_finite(data, count, size, dtype):
     for value in (loss, error):
         (gradient,) = torch.autograd.grad(value, features, retain_graph=True)
         assert gradient.isfinite().all()
+
+
+@covers(geometry.matched_depth_loss)
+@given(st.data(), COUNTS, st.integers(1, 40))
+def test_a_ray_is_at_most_its_length_away_from_a_matched_point(data, num_rays, samples):
+    depth = data.draw(tensors((num_rays, samples), -30, 2, dtype=torch.float32)).clamp(max=80)
+    weights = compositing.dense_weights(depth).requires_grad_()
+    edges = sampling.even_edges(num_rays, samples, torch.device("cpu"))
+    aim = torch.rand(num_rays, 1, generator=torch.Generator().manual_seed(data.draw(SEEDS)))
+    loss = geometry.matched_depth_loss(weights, edges, aim)
+    assert -1e-6 <= loss <= 1 + 1e-5
+    loss.backward()
+    assert (weights.grad <= 0).all() and weights.grad.isfinite().all()
 
 
 @covers(geometry.near_density)

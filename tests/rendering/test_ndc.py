@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from sparsestyle_ns.rendering.ndc import ndc_distance, ndc_points, ndc_rays
+from sparsestyle_ns.rendering.ndc import ndc_distance, ndc_parameter, ndc_points, ndc_rays
 
 FOCAL_OVER_HALF_SIZE = (1.6, 2.1)
 
@@ -100,6 +100,7 @@ def test_distance_is_the_inverse_of_projection():
     z = ndc_points(origins + world_distance * directions, FOCAL_OVER_HALF_SIZE, near)[..., 2:]
     t = (z + 1) / 2  # z' = -1 + 2 t'
     torch.testing.assert_close(ndc_distance(t, origins, directions, near), world_distance.expand(4, 6, 1))
+    torch.testing.assert_close(ndc_parameter(world_distance, origins, directions, near), t)
 
 
 def test_distance_grows_along_the_samples_of_a_ray_that_share_its_origin():

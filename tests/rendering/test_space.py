@@ -104,6 +104,23 @@ def test_a_walk_along_the_world_ray_arrives_at_the_field_coordinates(scene, s):
     torch.testing.assert_close(segments.positions(s)[segments.hit, 0], arrived[segments.hit], atol=1e-4, rtol=0)
 
 
+@pytest.mark.parametrize("s", [0.0, 0.2, 0.5, 0.9, 0.99])
+def test_at_distance_is_the_inverse_of_distance(scene, s):
+    space, origins, directions, _ = scene
+    segments = space.segments(origins, directions)
+    s = torch.full((RAYS, 1), s)
+    found = segments.at_distance(segments.distance(s))
+    torch.testing.assert_close(found[segments.hit], s[segments.hit], atol=2e-4, rtol=0)
+
+
+def test_what_lies_before_or_behind_the_scene_is_at_the_ends_of_its_segments(scene):
+    space, origins, directions, _ = scene
+    segments = space.segments(origins, directions)
+    for distance, end in ((-1.0, 0.0), (0.0, 0.0), (1e30, 1.0)):
+        found = segments.at_distance(torch.full((RAYS, 1), distance))[segments.hit]
+        torch.testing.assert_close(found, torch.full_like(found, end))
+
+
 def test_distance_grows_along_a_segment_and_ends_at_the_distance_that_stands_for_infinity(scene):
     space, origins, directions, _ = scene
     segments = space.segments(origins, directions)

@@ -1,0 +1,73 @@
+"""The depth of points that two photos share, which a coarse field of few photos can't be sure of by colours alone."""
+
+from dataclasses import dataclass
+from typing import Any, Dict, List, Tuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sparsestyle_ns.effects.base import Effect, Measurement
+from sparsestyle_ns.effects.matches import distances_along
+from sparsestyle_ns.effects.scene import Scene
+
+MIN_POINTS = 50
+"""Points below which there is too little to learn depth from, and wrong matches weigh too much."""
+
+
+@dataclass
+class MatchedRays:
+    """Rays to points whose depth is known.
+
+    Attributes:
+        origins, directions: world rays, directions of unit length.
+        distances: from the origin to the point, in world units.
+        views: index of the training view.
+    """
+
+    origins: Float[Tensor, "rays 3"]
+    directions: Float[Tensor, "rays 3"]
+    distances: Float[Tensor, "rays 1"]
+    views: Int[Tensor, "rays"]
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+
+def matched_rays(scene: Scene) -> MatchedRays:
+    """Two rays for each point that two photos share and that lies in front of both, one from each camera.
+
+    Points are where the two rays come nearest to each other.
+    """
+    matches, poses = scene.matches, scene.camera_to_worlds
+    photos = np.array(scene.matched_views, dtype=int)
+    views = photos[matches.first], photos[matches.second]
+    origins = poses[views[0], :, 3], poses[views[1], :, 3]
+    directions = matches.directions_first, matches.directions_second
+    distances = distances_along(origins[0], directions[0], origins[1], directions[1])
+    ahead = np.isfinite(distances[0]) & (distances[0] > 0) & (distances[1] > 0)
+
+    def of_both(parts: Tuple[np.ndarray, np.ndarray]) -> Tensor:
+        return torch.from_numpy(np.concatenate([part[ahead] for part in parts]))
+
+    return MatchedRays(
+        of_both(origins).float(), of_both(directions).float(), of_both(distances).float()[:, None], of_both(views)
+    )
+
+
+class MatchedDepth(Effect):
+    """Stage 1 sees to it that rays to matched points end there (DS-NeRF's idea, Deng et al. 2022, without COLMAP)."""
+
+    name = "matched_depth"
+    help = "Depth of points that two photos share, from matching."
+
+    def measure(self, scene: Scene) -> Measurement:
+        """See `Effect.measure`; the number of points that are matched and triangulated."""
+        count = len(matched_rays(scene)) // 2
+        words = "points are seen by two photos, so that their depth is known"
+        return Measurement(count >= MIN_POINTS, words, float(count), float(MIN_POINTS), possible=count > 0)
+
+    def build(self, parameters: Dict[str, List[float]], **needs: Any) -> MatchedRays:
+        """See `Effect.build`; needs the scene."""
+        return matched_rays(needs["scene"])
