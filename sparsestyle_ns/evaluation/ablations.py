@@ -18,7 +18,12 @@ from sparsestyle_ns.evaluation.study import (
 from sparsestyle_ns.evaluation.study_page import Section, line_plot
 
 Kinds = Tuple[str, str]
-COARSE_NAMES = {"ours": "our stage 1", "vanilla": "vanilla NeRF", "freenerf": "FreeNeRF's regularisers"}
+COARSE_NAMES = {
+    "ours": "our stage 1",
+    "paper": "stage 1 as the paper writes it",
+    "vanilla": "vanilla NeRF",
+    "freenerf": "FreeNeRF's regularisers",
+}
 FRAMEWORK: Dict[str, Kinds] = {
     "ours": ("ours", "ours"),
     **{

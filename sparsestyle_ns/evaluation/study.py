@@ -31,6 +31,7 @@ HIGH_FREQUENCIES = (
 )
 COARSE_KINDS: Dict[str, Tuple[str, ...]] = {
     "ours": (),
+    "paper": ("--pipeline.model.distortion-weight", "0"),
     "vanilla": (*HIGH_FREQUENCIES, "--pipeline.model.coarse-field.num-layers", "8"),
     "freenerf": (
         *HIGH_FREQUENCIES,
@@ -38,11 +39,14 @@ COARSE_KINDS: Dict[str, Tuple[str, ...]] = {
         *("--pipeline.model.occlusion-weight", "0.01"),
     ),
 }
-"""Stage 1: as it is; NeRF's ten octaves, eight layers and view dependence; ten octaves with FreeNeRF's regularisers."""
+"""Stage 1: as it is; as the paper writes it, on colours alone; NeRF's ten octaves, eight layers and view dependence; and
+ten octaves with FreeNeRF's regularisers."""
+COLORS_ALONE = ("--pipeline.effects.view-color", "on", "--pipeline.effects.matched-depth", "off")
 SCENE_KINDS: Dict[str, Tuple[str, ...]] = {
     "ours": (),
-    "vanilla": ("--pipeline.effects.view-color", "on"),
-    "freenerf": ("--pipeline.effects.view-color", "on"),
+    "paper": COLORS_ALONE,
+    "vanilla": COLORS_ALONE,
+    "freenerf": COLORS_ALONE,
 }
 """What both stages have to be told of a kind of stage 1."""
 FINE_TUNING = (

@@ -52,7 +52,9 @@ def test_each_ablation_of_the_paper_is_a_run_and_none_is_done_twice(painting: Pa
     runs = ablation_experiments(study(), painting)
     names = [each.name.removesuffix(f"-{painting.stem}") for each in runs]
     assert len(set(names)) == len(names)
-    framework = {f"{coarse}-{style}" for coarse in ("ours", "vanilla", "freenerf") for style in ("ours", "arf")}
+    framework = {
+        f"{coarse}-{style}" for coarse in ("ours", "paper", "vanilla", "freenerf") for style in ("ours", "arf")
+    }
     assert set(names) == framework | {f"ours-{kind}" for kind in STYLE_KINDS}
     assert {each.name for each in comparison_experiments(study(), painting)} <= {each.name for each in runs}
     with_pictures = {name for name, each in zip(names, runs, strict=True) if each.stops}
@@ -74,8 +76,10 @@ def test_every_flag_of_every_kind_is_one_that_ns_train_knows(llff_scene: Path, p
     parsed = {each.name: parse(each, scene, 7) for each in wanted}
     assert all(config.max_num_iterations == 7 for config in parsed.values())
     assert all(config.pipeline.datamanager.max_image_side == 64 for config in parsed.values())
-    octaves = {kind: parsed[kind].pipeline.model.coarse_field.num_levels for kind in ("ours", "vanilla", "freenerf")}
-    assert octaves == {"ours": 7, "vanilla": 10, "freenerf": 10}
+    octaves = {
+        kind: parsed[kind].pipeline.model.coarse_field.num_levels for kind in ("ours", "paper", "vanilla", "freenerf")
+    }
+    assert octaves == {"ours": 7, "paper": 7, "vanilla": 10, "freenerf": 10}
     assert parsed["freenerf"].pipeline.model.occlusion_weight > 0 == parsed["vanilla"].pipeline.model.occlusion_weight
     settings = {kind: parsed[f"ours-{kind}-{painting.stem}"].pipeline for kind in STYLE_KINDS}
     encodings = {kind: config.model.fine_encoding for kind, config in settings.items()}
@@ -191,7 +195,7 @@ def test_ablations_set_out_each_group_with_traces_and_pictures_on_the_way(
     monkeypatch.setattr(Laboratory, "run", lambda *_: None)
     sections = ablate(study(), [painting], Laboratory(study().scene, 1))
     assert [section.heading.split(":")[0] for section in sections[1:]] == list(GROUPS)
-    assert [name for name, _ in sections[0].tables[0].rows] == ["ours", "vanilla", "freenerf"]
+    assert [name for name, _ in sections[0].tables[0].rows] == ["ours", "paper", "vanilla", "freenerf"]
     for section, (_, rows) in zip(sections[1:], GROUPS.values(), strict=True):
         assert [name for name, _ in section.tables[0].rows][: len(rows)] == list(rows)
     annealing = sections[-1]
