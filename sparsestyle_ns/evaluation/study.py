@@ -39,7 +39,7 @@ COARSE_KINDS: Dict[str, Tuple[str, ...]] = {
         *("--pipeline.model.occlusion-weight", "0.01"),
     ),
 }
-"""Stage 1: as it is; as the paper writes it, on colours alone; NeRF's ten octaves, eight layers and view dependence; and
+"""Stage 1: as it is; as the paper writes it, on colours alone; NeRF's ten octaves, eight layers, view dependence; and
 ten octaves with FreeNeRF's regularisers."""
 COLORS_ALONE = ("--pipeline.effects.view-color", "on", "--pipeline.effects.matched-depth", "off")
 SCENE_KINDS: Dict[str, Tuple[str, ...]] = {
