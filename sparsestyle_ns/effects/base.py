@@ -105,7 +105,9 @@ class Decisions:
     items: Tuple[Decision, ...]
 
     def __getitem__(self, name: str) -> Decision:
-        return next(item for item in self.items if item.name == name)
+        """The decision about an effect; off where a run is older than the effect."""
+        unknown = Decision(name, False, None, None, "not known yet when this was decided")
+        return next((item for item in self.items if item.name == name), unknown)
 
     def on(self, name: str) -> bool:
         """Whether an effect is simulated."""

@@ -65,7 +65,7 @@ def decide(scene: Scene, settings: Any, inherited: Optional[Decisions] = None) -
         InputError: an effect is asked for that can't be had, or there isn't exactly one layout of space.
     """
     if inherited is not None:
-        taken = Decisions(tuple(item for item in inherited.items if EFFECTS[item.name].source == "photos"))
+        taken = Decisions(tuple(inherited[name] for name, effect in EFFECTS.items() if effect.source == "photos"))
         taken.check_choices(settings, "the coarse run")
         new = {name: effect.measure(scene) for name, effect in EFFECTS.items() if effect.source != "photos"}
         made = {item.name: item for item in taken.items}

@@ -207,6 +207,14 @@ def test_a_stylised_run_takes_over_what_photos_decided_and_refuses_to_decide_oth
         decide(scene, EffectSettings(exposure="off"), coarse)
 
 
+def test_what_a_run_was_made_before_is_off_in_it(made):
+    older = Decisions(tuple(item for item in decided("box", "exposure").items if item.name != "matched_depth"))
+    assert older.build("matched_depth") is None
+    decisions = decide(made("blender", *OBJECT), ALL_AUTO, older)
+    assert not decisions.on("matched_depth") and decisions.on("exposure")
+    assert "not known" in decisions["matched_depth"].reason
+
+
 def test_a_decision_is_made_again_only_where_nobody_asked_for_it(made):
     scene = dataclasses.replace(made("blender", *OBJECT), coarse_density=fog(5.0))
     auto, asked = decided("box", "empty_space"), decide(scene, EffectSettings(empty_space="on"))
