@@ -53,7 +53,7 @@ def small_config(method: str, folder: Path, layout: str, steps: int, effects: Di
     pipeline = config.pipeline
     pipeline.effects = EffectSettings(**effects)
     manager, field = pipeline.datamanager, pipeline.model.coarse_field
-    manager.data, manager.dataparser, manager.num_views = folder, PARSERS[layout](), 12
+    manager.data, manager.dataparser, manager.num_views = folder, PARSERS[layout](), 100
     field.layer_width, field.num_layers, field.feature_dim = 64, 3, 32
     config.max_num_iterations = steps
     return config
@@ -111,6 +111,7 @@ def held_out_psnr(folder: Path, layout: str, steps: int, effects: Dict[str, str]
     [
         ("llff", (), {"ndc": "on"}, {"contraction": "on"}),
         ("blender", (), {"box": "on"}, {"contraction": "on"}),
+        ("nerfstudio", ("--num-views", "48"), {"contraction": "on"}, {"box": "on"}),
         ("blender", (), {"background": "on"}, {"background": "off"}),
         ("llff", ("--shiny", "0.8"), {"view_color": "on"}, {"view_color": "off"}),
         ("llff", ("--exposure", "0.7"), {"exposure": "on"}, {"exposure": "off"}),
