@@ -53,7 +53,9 @@ def small_config(method: str, folder: Path, layout: str, steps: int, effects: Di
     pipeline = config.pipeline
     pipeline.effects = EffectSettings(**effects)
     manager, field = pipeline.datamanager, pipeline.model.coarse_field
-    manager.data, manager.dataparser, manager.num_views = folder, PARSERS[layout](), 100
+    manager.data, manager.dataparser = folder, PARSERS[layout]()
+    parser = PARSERS[layout](data=folder).setup()
+    manager.num_views = len(parser.get_dataparser_outputs("train").image_filenames)
     field.layer_width, field.num_layers, field.feature_dim = 64, 3, 32
     config.max_num_iterations = steps
     return config
