@@ -12,8 +12,8 @@ from sparsestyle_ns.effects.base import Effect, Measurement
 from sparsestyle_ns.effects.matches import distances_along
 from sparsestyle_ns.effects.scene import Scene
 
-MIN_POINTS = 50
-"""Points below which there is too little to learn depth from, and wrong matches weigh too much."""
+MIN_POINTS = 100
+"""Matched points in a photo, on average, below which depth is known in too few places to be worth its cost."""
 
 
 @dataclass
@@ -63,10 +63,10 @@ class MatchedDepth(Effect):
     help = "Depth of points that two photos share, from matching."
 
     def measure(self, scene: Scene) -> Measurement:
-        """See `Effect.measure`; the number of points that are matched and triangulated."""
-        count = len(matched_rays(scene)) // 2
-        words = "points are seen by two photos, so that their depth is known"
-        return Measurement(count >= MIN_POINTS, words, float(count), float(MIN_POINTS), possible=count > 0)
+        """See `Effect.measure`; how many points of a photo, on average, are matched and triangulated."""
+        count = len(matched_rays(scene)) / max(1, len(scene.matched_views))
+        words = "points of a photo are seen by another, so that their depth is known"
+        return Measurement(count >= MIN_POINTS, words, count, float(MIN_POINTS), possible=count > 0)
 
     def build(self, parameters: Dict[str, List[float]], **needs: Any) -> MatchedRays:
         """See `Effect.build`; needs the scene."""

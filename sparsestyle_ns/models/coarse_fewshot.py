@@ -80,7 +80,7 @@ class CoarseFewShotModelConfig(ModelConfig):
     """Share of the iterations after which the distortion loss sets in."""
     distortion_ramp: float = 0.3
     """Share of the iterations in which it then grows to its weight; 0 is at once."""
-    matched_depth_weight: float = 0.05
+    matched_depth_weight: float = 0.02
     """Weight of the distance between matched points and where their rays end, where `matched_depth` is on."""
     occlusion_weight: float = 0.0
     """Weight of density close to the camera (FreeNeRF's occlusion loss); 0 is off."""

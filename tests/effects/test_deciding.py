@@ -128,7 +128,7 @@ def test_lego_is_simulated_in_a_box_before_white(capsys):
     main(["effects", "blender-data", "--data", str(DATA / "blender" / "lego"), "--json"])
     effects = {effect["name"]: effect for effect in json.loads(capsys.readouterr().out)["effects"]}
     on = {name for name, effect in effects.items() if effect["on"]}
-    assert on == {"box", "background", "matched_depth", "empty_space", "residual_density", "palette"}
+    assert on == {"box", "background", "empty_space", "residual_density", "palette"}
     assert effects["background"]["parameters"] == {"color": [1.0, 1.0, 1.0]}
 
 
