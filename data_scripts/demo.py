@@ -390,7 +390,6 @@ def train_command(method: str, flags: List[str], scene: Path, outputs: Path, ite
     """ns-train for a sample scene, without a viewer and with a log that can be piped."""
     command = ["ns-train", method, *flags, "--data", str(scene), "--output-dir", str(outputs)]
     command += ["--vis", "tensorboard", "--viewer.quit-on-train-completion", "True"]
-    command += ["--logging.local-writer.max-log-size", "0"]
     if iterations is not None:
         command += ["--max-num-iterations", str(iterations)]
     return [*command, f"{scene.name}-data"]

@@ -17,7 +17,7 @@ from PIL import Image
 from sparsestyle_ns.coarse_run import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.evaluation.camera_path import measuring_path
 from sparsestyle_ns.evaluation.experiments import Experiment, SceneSettings
-from sparsestyle_ns.evaluation.held_out import evaluate_run, stylisation_figures
+from sparsestyle_ns.evaluation.held_out import REPORT_FILE, evaluate_run, saved_report, stylisation_figures
 from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.evaluation.path_frames import PathFrames, render_path
 from sparsestyle_ns.evaluation.style_strength import gram_matrix
@@ -198,12 +198,8 @@ def measure_frames_of_2d(
 
 def measure_coarse(folder: Path) -> Dict[str, float]:
     """A coarse run's figures on its held-out views, kept beside it."""
-    step, path = _newest_step(folder), folder / "evaluation.json"
-    if path.is_file():
-        content = json.loads(path.read_text())
-        if content["step"] == step:
-            return content["results"]
-    return evaluate_run(folder / "config.yml", path).means
+    known = saved_report(folder, _newest_step(folder))
+    return known.means if known is not None else evaluate_run(folder / "config.yml", folder / REPORT_FILE).means
 
 
 def _newest_step(folder: Path) -> int:
