@@ -440,7 +440,12 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     for heading, seconds in demo.durations:
         print(f"  {'before' if seconds is None else clock(seconds):>6}  {heading}")
     print(f"  {clock(time.monotonic() - start):>6}  in all\n")
-    print(f"Look at {(options.output / 'index.html').resolve()}")
+    viewer = [
+        "ns-viewer",
+        "--load-config",
+        str(newest_run(options.output / "outputs" / options.scene, STYLE) / "config.yml"),
+    ]
+    print(f"Made {(options.output / 'index.html').resolve()} – next: {shlex.join(viewer)}")
     return 0
 
 

@@ -1,7 +1,8 @@
 """How far long work is, and how long it still takes: bars on a terminal, a line now and then in a log.
 
 All bars of a process are on one display, also those of several threads and bars within bars, so that none overwrites
-another and what is printed meanwhile appears above them. Where CONSOLE is quiet, nothing is shown.
+another and what is printed meanwhile appears above them. Of several processes that train together, the first shows
+them; where CONSOLE is quiet, nothing is shown.
 """
 
 import threading
@@ -9,6 +10,7 @@ import time
 from contextlib import contextmanager
 from typing import Iterator, Optional, Sequence, TypeVar
 
+from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
@@ -99,7 +101,8 @@ def track(items: Sequence[T], description: str) -> Iterator[T]:
 
 def say(line: str) -> None:
     """A line of plain text, above the bars if there are any."""
-    CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
+    if comms.is_main_process():
+        CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def seconds_left(task: Task) -> Optional[float]:
@@ -127,6 +130,10 @@ class _TimeLeftColumn(ProgressColumn):
         return Text("" if left is None else f"{duration(left)} left", style="progress.remaining")
 
 
+def _can_draw() -> bool:
+    return CONSOLE.is_terminal and not (CONSOLE.is_dumb_terminal or CONSOLE.quiet) and comms.is_main_process()
+
+
 _lock = threading.Lock()
 _display: Optional[Progress] = None
 _users = 0
@@ -148,7 +155,7 @@ def _shared_display() -> Iterator[Progress]:
                 transient=True,
                 refresh_per_second=REFRESHES,
                 speed_estimate_period=SPEED_PERIOD,
-                disable=CONSOLE.quiet or CONSOLE.is_dumb_terminal or not CONSOLE.is_terminal,
+                disable=not _can_draw(),
             )
             _display.start()
         _users += 1

@@ -232,10 +232,10 @@ class SparseStyleTrainer(Trainer):
             InputError: the gradients of too many iterations in a row weren't finite.
         """
         result = super().train_iteration(step)
-        logs = (step + 1) % self.config.logging.steps_per_log == 0
-        self._bar.advance(
-            note=", ".join(f"{name} {float(value):.3g}" for name, value in result[2].items()) if logs else None
-        )
+        note = None
+        if (step + 1) % self.config.logging.steps_per_log == 0:  # reading the values waits for a GPU
+            note = ", ".join(f"{name} {float(value):.3g}" for name, value in result[2].items())
+        self._bar.advance(note=note)
         if (step + 1) % STEPS_PER_LOOK == 0:
             self._look_at_skipped(step)
         self._interrupted = any_process(self._interrupted, self.pipeline.device)

@@ -3,19 +3,16 @@
 import io
 import re
 import threading
-from pathlib import Path
 
 import pytest
-import tyro
-from conftest import TINY, TINY_STYLE, ns_train, only_run
-from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
-from PIL import Image
+from nerfstudio.engine.trainer import Trainer
 from rich.console import Console
 
 from sparsestyle_ns import progress
 from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.next_command import finish, resume_command
+from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.preview import preview_steps
+from sparsestyle_ns.trainer import CoarseFewShotTrainer
 
 
 class Clock:
@@ -147,30 +144,6 @@ def test_durations_are_said_in_minutes_or_hours(seconds: float, words: str) -> N
     assert progress.duration(seconds) == words
 
 
-def test_the_last_line_can_be_typed_as_it_stands(capsys: pytest.CaptureFixture) -> None:
-    finish(Path("out/my scene"), ["ns-viewer", "--load-config", Path("out/my scene/config.yml")])
-    assert capsys.readouterr().out == "Made out/my scene – next: ns-viewer --load-config 'out/my scene/config.yml'\n"
-
-
-def test_resuming_types_the_same_command_with_the_checkpoints() -> None:
-    typed = [
-        "hier-style",
-        "--load-dir",
-        "old",
-        "--style-image",
-        "a.jpg",
-        "--load-step=3",
-        "--data",
-        "fern",
-        "llff-data",
-    ]
-    given = resume_command("hier-style", Path("run/nerfstudio_models"), typed)
-    assert given == [
-        *("ns-train", "hier-style", "--load-dir", "run/nerfstudio_models"),
-        *("--style-image", "a.jpg", "--data", "fern", "llff-data"),
-    ]
-
-
 def test_previews_are_due_at_shares_of_the_iterations_and_never_before_the_first() -> None:
     assert preview_steps((0.05, 0.5, 1.0), 200) == {10, 100, 200}
     assert preview_steps((0.05, 1.0), 3) == {1, 3}
@@ -183,60 +156,14 @@ def test_previews_outside_of_training_are_refused(share: float) -> None:
         preview_steps((share,), 100)
 
 
-def last_line(capsys: pytest.CaptureFixture) -> str:
-    return capsys.readouterr().out.splitlines()[-1]
+def test_a_closed_viewer_ends_training_without_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def close(self: Trainer) -> None:
+        raise KeyboardInterrupt
 
-
-def typed_after(line: str) -> list:
-    """The arguments of the command that a last line says to type next."""
-    import shlex
-
-    return shlex.split(line.split(" – next: ")[1])
-
-
-def test_training_writes_previews_and_ends_with_a_command_that_works(
-    llff_scene: Path, painting: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    flags = ["--view-ids", "1", "5", "11", "--max-num-iterations", "4", "--previews", "0.25", "1.0"]
-    ns_train("coarse-fewshot", llff_scene, tmp_path, *flags, "--pipeline.effects.view-color", "on", *TINY)
-    run = only_run(tmp_path, "coarse-fewshot")
-    line = last_line(capsys)
-    assert line.startswith(f"Made {run} – next: ns-train hier-style --style-image PAINTING.jpg ")
-    assert sorted(path.name for path in (run / "previews").iterdir()) == ["after-000001.png", "after-000004.png"]
-    with Image.open(run / "previews" / "after-000004.png") as picture:
-        assert picture.size == (2 * 32, 24)
-    command = [str(painting) if part == "PAINTING.jpg" else part for part in typed_after(line)]
-    parsed = tyro.cli(AnnotatedBaseConfigUnion, args=command[1:])
-    assert parsed.pipeline.datamanager.view_ids == (1, 5, 11)
-    assert parsed.data == llff_scene
-    assert parsed.output_dir == tmp_path
-    assert parsed.pipeline.effects.view_color == "on"
-    assert parsed.pipeline.coarse_run == run
-
-    # Typed with settings of a tiny field, it runs, and says what comes after it.
-    more = ["--max-num-iterations", "2", *TINY_STYLE]
-    at = command.index("--coarse-run")
-    ns_train(
-        "hier-style",
-        llff_scene,
-        tmp_path,
-        *command[2 : at + 2],
-        *flags[:4],
-        *more,
-        "--pipeline.effects.view-color",
-        "on",
-    )
-    styled = only_run(tmp_path, "hier-style")
-    assert last_line(capsys) == f"Made {styled} – next: sparsestyle gallery {styled}"
-    with Image.open(styled / "previews" / "after-000002.png") as picture:
-        assert picture.size == (3 * 32, 24)
-    assert tensorboard_images(styled) == {"Preview": [1, 2]}
-
-
-def tensorboard_images(run: Path) -> dict:
-    """The steps of each picture that a run has in tensorboard."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    events = EventAccumulator(str(run), size_guidance={"images": 0})
-    events.Reload()
-    return {tag: [event.step for event in events.Images(tag)] for tag in events.Tags()["images"]}
+    monkeypatch.setattr(Trainer, "_train_complete_viewer", close)
+    trainer = CoarseFewShotTrainer.__new__(CoarseFewShotTrainer)
+    trainer.config = method_config("coarse-fewshot")
+    said = []
+    trainer.finish = lambda: said.append("the last line")
+    trainer._train_complete_viewer()
+    assert said == ["the last line"]  # while the viewer is open; the command says it again when it ends
