@@ -40,11 +40,8 @@ def gallery(
             it, else a flight through the photos' viewpoints.
         evaluate: Measure runs that have no evaluation.json of their newest checkpoint, and leave them one.
     """
-    from sparsestyle_ns.gallery.collect import collect_run, read_video
-    from sparsestyle_ns.gallery.page import gallery_page
-    from sparsestyle_ns.next_command import finish
+    from sparsestyle_ns.gallery.page import gallery_page, read_film
     from sparsestyle_ns.page import prepare_page, write_page
-    from sparsestyle_ns.progress import say
     from sparsestyle_ns.run_folder import STYLE_METHOD, find_config
 
     if not runs:
@@ -55,8 +52,12 @@ def gallery(
         raise InputError(f"--frames is {frames}; give 0 for no film, or more.")
     configs = [find_config(run, STYLE_METHOD) for run in runs]
     for path in video:
-        read_video(path)
+        read_film(path)
     prepare_page(output_path)  # rendering takes minutes, so what can fail without it fails before
+    from sparsestyle_ns.gallery.collect import collect_run
+    from sparsestyle_ns.next_command import finish
+    from sparsestyle_ns.progress import say
+
     videos = [*video, *[None] * (len(runs) - len(video))]
     pictures = []
     for config, path in zip(configs, videos, strict=True):
@@ -86,17 +87,18 @@ def evaluate(
         style_image: Painting to measure a stylised run against, if not the one it was made with; needs --output-path.
         baked: Also measure how close a stylised run's baked renders are to exact ones (PSNR in dB).
     """
-    from sparsestyle_ns.evaluation.held_out import REPORT_FILE, evaluate_run
-    from sparsestyle_ns.evaluation.tables import report_tables
-    from sparsestyle_ns.next_command import after_evaluation, finish
     from sparsestyle_ns.output_file import prepare_output
-    from sparsestyle_ns.run_folder import find_config
+    from sparsestyle_ns.run_folder import REPORT_FILE, find_config
 
     config = find_config(run)
     if output_path is None and style_image is not None:
         raise InputError(f"{REPORT_FILE} in the run's folder is for its own painting; name a file with --output-path.")
     path = output_path or config.parent / REPORT_FILE
-    prepare_output(path, "The report", "report.json")  # measuring takes minutes
+    prepare_output(path, "The report", "report.json")  # measuring takes minutes, so what can fail fails before
+    from sparsestyle_ns.evaluation.held_out import evaluate_run
+    from sparsestyle_ns.evaluation.tables import report_tables
+    from sparsestyle_ns.next_command import after_evaluation, finish
+
     report = evaluate_run(config, path, style_image, baked)
     for table in report_tables(report.means, len(report.views)):
         table.print()
@@ -330,7 +332,6 @@ def export(
         resolution: html: cells along a side of the scene's cube. 255 fits into the graphics memory that every browser
             with WebGL2 promises.
     """
-    from sparsestyle_ns.next_command import after_export, finish
     from sparsestyle_ns.output_file import prepare_output
     from sparsestyle_ns.run_folder import STYLE_METHOD, find_config
 
@@ -342,6 +343,7 @@ def export(
         output_path, "The scene", example
     )  # rendering takes minutes, so what can fail without it fails before
     from sparsestyle_ns.export.command import export_mesh, export_page, export_points, load_scene
+    from sparsestyle_ns.next_command import after_export, finish
 
     scene = load_scene(config)
     if format == "html":

@@ -26,11 +26,9 @@ from sparsestyle_ns.rendering.compositing import dense_weights, effective_sample
 from sparsestyle_ns.rendering.density_grid import interval_lengths
 from sparsestyle_ns.rendering.precision import autocast
 from sparsestyle_ns.rendering.sampling import even_edges
-from sparsestyle_ns.run_folder import load_run
+from sparsestyle_ns.run_folder import REPORT_FILE, load_run
 from sparsestyle_ns.style.targets import StyleTargets, covered_rows
 
-REPORT_FILE = "evaluation.json"
-"""The report of a run, in its folder."""
 EVEN_SAMPLES = 64
 """Even samples a ray on which `mean_effective_samples` counts: the number means something only with this one."""
 MIN_ACCUMULATION = 0.5

@@ -17,12 +17,12 @@ from PIL import Image
 from sparsestyle_ns.coarse_run import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.evaluation.camera_path import measuring_path
 from sparsestyle_ns.evaluation.experiments import Experiment, SceneSettings
-from sparsestyle_ns.evaluation.held_out import REPORT_FILE, evaluate_run, saved_report, stylisation_figures
+from sparsestyle_ns.evaluation.held_out import evaluate_run, saved_report, stylisation_figures
 from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.evaluation.path_frames import PathFrames, render_path
 from sparsestyle_ns.evaluation.style_strength import gram_matrix
 from sparsestyle_ns.method_configs import method_config
-from sparsestyle_ns.run_folder import load_run
+from sparsestyle_ns.run_folder import REPORT_FILE, load_run
 from sparsestyle_ns.style.targets import StyleTargets
 
 HIGH_FREQUENCIES = (

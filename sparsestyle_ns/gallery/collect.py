@@ -9,32 +9,17 @@ from jaxtyping import Float
 from PIL import Image, ImageOps
 
 from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.evaluation.held_out import REPORT_FILE, SavedReport, evaluate_held_out, exact_outputs, saved_report
+from sparsestyle_ns.evaluation.held_out import SavedReport, evaluate_held_out, exact_outputs, saved_report
 from sparsestyle_ns.evaluation.tables import report_tables
 from sparsestyle_ns.gallery.film import as_pixels, make_film
-from sparsestyle_ns.gallery.page import Film, Picture, RunPictures, View
+from sparsestyle_ns.gallery.page import Picture, RunPictures, View, read_film
 from sparsestyle_ns.page import Pixels
 from sparsestyle_ns.progress import track
-from sparsestyle_ns.run_folder import STYLE_METHOD, find_config, load_run
+from sparsestyle_ns.run_folder import REPORT_FILE, STYLE_METHOD, find_config, load_run
 from sparsestyle_ns.view_selection import evenly_spaced
 
 LONGEST_SIDE = 512
 """Pixels that a picture on the page has at most along its longer side."""
-
-
-def read_video(path: Path) -> bytes:
-    """An MP4 file's bytes.
-
-    Raises:
-        InputError: it can't be read or is no MP4.
-    """
-    try:
-        content = path.readas_pixels()
-    except OSError as error:
-        raise InputError(f"The video {path} can't be read ({error.strerror}).") from error
-    if content[4:8] != b"ftyp":
-        raise InputError(f"{path} is no MP4 video; give one that ns-render wrote.")
-    return content
 
 
 def collect_run(
@@ -54,7 +39,7 @@ def collect_run(
         InputError: it isn't a finished run of this package, its photos are gone, or the video can't be read.
     """
     config_path = find_config(config_path, STYLE_METHOD)
-    film = None if video is None else Film(read_video(video), "A flight through the stylised scene.")
+    film = None if video is None else read_film(video)
     if num_views < 1:
         raise InputError(f"--num-views is {num_views}; at least one view is needed.")
     config, pipeline, step = load_run(config_path)

@@ -8,8 +8,10 @@ import base64
 from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
+from pathlib import Path
 from typing import Dict, List, Optional, Sequence, Tuple
 
+from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.tables import Table
 from sparsestyle_ns.page import Pixels, figure, image, picture_page, table
 
@@ -55,6 +57,21 @@ class Film:
 
     content: bytes
     caption: str
+
+
+def read_film(path: Path) -> Film:
+    """A film from an MP4 file.
+
+    Raises:
+        InputError: it can't be read or is no MP4.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"The video {path} can't be read ({error.strerror}).") from error
+    if content[4:8] != b"ftyp":
+        raise InputError(f"{path} is no MP4 video; give one that ns-render wrote.")
+    return Film(content, "A flight through the stylised scene.")
 
 
 @dataclass

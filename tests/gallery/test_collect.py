@@ -14,22 +14,22 @@ from sparsestyle_ns.coarse_run import newest_checkpoint
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.camera_path import axes_meet, measuring_path, showing_path
 from sparsestyle_ns.evaluation.held_out import saved_report
-from sparsestyle_ns.gallery.collect import collect_run, depth_picture, read_video
+from sparsestyle_ns.gallery.collect import collect_run, depth_picture
 from sparsestyle_ns.gallery.film import FRAMES_PER_SECOND, encode_mp4, make_film
-from sparsestyle_ns.gallery.page import gallery_page
+from sparsestyle_ns.gallery.page import gallery_page, read_film
 
 MP4 = b"\x00\x00\x00\x18ftypmp42 the rest of a film"
 
 
-def test_read_video_takes_mp4_only(tmp_path):
+def test_films_are_mp4_only(tmp_path):
     film, text = tmp_path / "film.mp4", tmp_path / "film.txt"
     film.write_bytes(MP4)
     text.write_text("no film")
-    assert read_video(film) == MP4
+    assert read_film(film).content == MP4
     with pytest.raises(InputError, match="is no MP4 video"):
-        read_video(text)
+        read_film(text)
     with pytest.raises(InputError, match="can't be read"):
-        read_video(tmp_path / "gone.mp4")
+        read_film(tmp_path / "gone.mp4")
 
 
 def test_depth_picture_is_lighter_where_things_are_nearer():
@@ -62,7 +62,7 @@ def test_collect_run_shows_photos_and_held_out_views_wherever_the_run_is_now(run
     assert run.subtitle == "hier-style, 3 photos, 3 iterations"
     assert run.style_name == "painting"
     assert run.tables == []
-    assert read_film(run.film.content).shape == (3, 24, 32, 3)
+    assert frames_of(run.film.content).shape == (3, 24, 32, 3)
     assert "flight" in run.film.caption
     assert "<video" in gallery_page([run], "A run")
 
@@ -111,7 +111,7 @@ def test_a_run_without_a_report_is_measured_when_that_is_asked_for_and_keeps_it(
     assert newest_checkpoint(moved / "nerfstudio_models").name == "step-000000002.ckpt"
 
 
-def read_film(content):
+def frames_of(content):
     """The frames of a film."""
     return np.stack(list(iio.imiter(io.BytesIO(content), plugin="FFMPEG", extension=".mp4")))
 
@@ -121,7 +121,7 @@ def test_a_film_has_its_frames_and_its_speed():
     pictures = [np.broadcast_to(np.roll(ramp, 4 * index)[None, :, None], (48, 64, 3)) for index in range(5)]
     film = encode_mp4(pictures)
     assert film[4:8] == b"ftyp"
-    frames = read_film(film)
+    frames = frames_of(film)
     assert frames.shape == (5, 48, 64, 3)
     assert np.abs(frames.astype(int) - np.stack(pictures)).mean() < 6
     assert iio.immeta(film, plugin="FFMPEG", extension=".mp4")["fps"] == FRAMES_PER_SECOND

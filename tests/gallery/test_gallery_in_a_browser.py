@@ -28,7 +28,8 @@ def tab(tmp_path_factory):
     path = folder / "gallery.html"
     path.write_text(gallery_page([run, make_run(name="flower")], "Two scenes"), encoding="utf-8")
     with open_tab(folder / "profile", WIDTH, 700) as tab:
-        tab.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
+        moving = {"name": "prefers-reduced-motion", "value": "no-preference"}
+        tab.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}, moving])
         tab.open(path.as_uri())
         yield tab
 
@@ -93,6 +94,7 @@ def test_keys_move_the_slider(tab):
 
 
 def test_the_film_plays(tab):
+    tab.evaluate("document.querySelector('video').scrollIntoView({behavior: 'instant'})")  # out of sight it rests
     tab.wait_for("document.querySelector('video').readyState >= 2")
     size = tab.evaluate("[document.querySelector('video').videoWidth, document.querySelector('video').videoHeight]")
     assert size == [64, 48]
