@@ -372,10 +372,11 @@ def prepare(
         poses: Where the photos were taken from: a poses_bounds.npy or transforms.json beside them (file), as COLMAP
             works it out (colmap, through ns-process-data), or the file if there is one, else COLMAP (auto).
     """
-    from sparsestyle_ns.next_command import finish
     from sparsestyle_ns.prepare.command import prepare_scene
 
     scene = prepare_scene(photos, output, poses)
+    from sparsestyle_ns.next_command import finish
+
     made = f"{scene.folder}, {len(scene.names)} photos with poses"
     finish(made, ["ns-train", "coarse-fewshot", "--data", scene.folder, scene.parser])
 

@@ -22,6 +22,7 @@ from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.evaluation.path_frames import PathFrames, render_path
 from sparsestyle_ns.evaluation.style_strength import gram_matrix
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.progress import track
 from sparsestyle_ns.run_folder import REPORT_FILE, load_run
 from sparsestyle_ns.style.targets import StyleTargets
 
@@ -152,7 +153,7 @@ class Painter:
             self._targets = replace(settings, style_image=self.painting).load_targets(torch.device("cpu"))
             self._gram = gram_matrix(self._targets.style_rows())
         values = []
-        for index in range(0, len(frames.stylised), STYLE_EVERY):
+        for index in track(range(0, len(frames.stylised), STYLE_EVERY), "Style and content"):
             stylised, coarse = frames.stylised[index], frames.coarse[index]
             figures = stylisation_figures(
                 self._targets, self._gram, coarse, stylised, frames.surfaces[index].covered.float()
