@@ -22,7 +22,7 @@ from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
 from sparsestyle_ns.processes import average_gradients, num_processes, own_share, put_together
-from sparsestyle_ns.progress import bar, track
+from sparsestyle_ns.progress import track
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.volume import accumulation_of, seen_behind
 from sparsestyle_ns.schedules import content_weight
@@ -152,27 +152,23 @@ class HierStylePipeline(CheckedPipeline):
         keep_bytes = self._cache_bytes()
         pixels = self.datamanager.pixels
         frozen, pictures, weights = [], [], []
-        novel = self._novel_cameras()
-        with bar("Caching views", len(pixels.sizes) + len(novel)) as caching:
-            for index, (height, width) in enumerate(pixels.sizes):
-                rows = slice(pixels.starts[index], pixels.starts[index + 1])
-                view = self._freeze(pixels.origins[rows], pixels.directions[rows], keep_bytes)
-                keep_bytes -= view.kept_bytes
-                frozen.append(view)
-                accumulation = put_together(view.render(accumulation_of), height * width)
-                pictures.append(self._photo(index, pixels.colors[rows], accumulation).view(height, width, 3))
-                weights.append(accumulation.view(height, width))
-                caching.advance()
-            for camera in novel:
-                bundle = camera.generate_rays(camera_indices=0, keep_shape=True).to(self.device)
-                rays = bundle.flatten()
-                view = self._freeze(rays.origins, rays.directions, keep_bytes)
-                keep_bytes -= view.kept_bytes
-                frozen.append(view)
-                outputs = self.model.get_outputs_for_camera_ray_bundle(bundle)
-                pictures.append(outputs["rgb_coarse"])
-                weights.append(outputs["accumulation"].squeeze(-1))
-                caching.advance()
+        for index, (height, width) in enumerate(track(pixels.sizes, "Caching views")):
+            rows = slice(pixels.starts[index], pixels.starts[index + 1])
+            view = self._freeze(pixels.origins[rows], pixels.directions[rows], keep_bytes)
+            keep_bytes -= view.kept_bytes
+            frozen.append(view)
+            accumulation = put_together(view.render(accumulation_of), height * width)
+            pictures.append(self._photo(index, pixels.colors[rows], accumulation).view(height, width, 3))
+            weights.append(accumulation.view(height, width))
+        for camera in track(self._novel_cameras(), "Caching novel views"):
+            bundle = camera.generate_rays(camera_indices=0, keep_shape=True).to(self.device)
+            rays = bundle.flatten()
+            view = self._freeze(rays.origins, rays.directions, keep_bytes)
+            keep_bytes -= view.kept_bytes
+            frozen.append(view)
+            outputs = self.model.get_outputs_for_camera_ray_bundle(bundle)
+            pictures.append(outputs["rgb_coarse"])
+            weights.append(outputs["accumulation"].squeeze(-1))
         if self.effects.on("palette"):
             pictures = self._in_style_colors(pictures, weights)
         self.views = [
