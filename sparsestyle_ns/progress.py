@@ -58,7 +58,7 @@ class Bar:
             self._said, self._said_at = done, time.monotonic()
             left, note = seconds_left(task), task.fields["note"]
             say(
-                f"{task.description}: {done:g} of {task.total:g}{self._unit} ({task.percentage:.0f}%)"
+                f"{task.description}: {done:.0f} of {task.total:.0f}{self._unit} ({task.percentage:.0f}%)"
                 + ("" if left is None else f", {duration(left)} left")
                 + (f"; {note}" if note else "")
             )
@@ -68,7 +68,7 @@ class Bar:
         task = self.task
         if task.visible and task.finished and (task.finished_time or 0.0) >= WORTH_A_LINE:
             done = task.completed - task.fields["first"]
-            say(f"{task.description}: {done:g}{self._unit} in {duration(task.finished_time)}")
+            say(f"{task.description}: {done:.0f}{self._unit} in {duration(task.finished_time)}")
         self._display.remove_task(task.id)
 
 
