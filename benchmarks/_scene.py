@@ -139,7 +139,7 @@ def find_or_train_coarse(scene: Scene, options: Options) -> CoarseRun:
         command = ["-m", "nerfstudio.scripts.train", COARSE_METHOD, "--data", scene.folder, "--output-dir", folder]
         command += ["--max-num-iterations", iterations, "--optimizers.fields.scheduler.max-steps", iterations]
         command += ["--machine.device-type", device, "--vis", "tensorboard", "--viewer.quit-on-train-completion"]
-        command += ["True", "--logging.local-writer.max-log-size", "0", *(QUICK_COARSE if options.quick else [])]
+        command += ["True", *(QUICK_COARSE if options.quick else [])]
         command += ["llff-data"]
         environment = os.environ | {"OMP_NUM_THREADS": str(options.num_threads), "PYTHONWARNINGS": "ignore"}
         subprocess.run([sys.executable, *map(str, command)], env=environment, stdout=subprocess.DEVNULL)

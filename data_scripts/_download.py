@@ -8,6 +8,7 @@ import argparse
 import contextlib
 import http.client
 import os
+import shlex
 import shutil
 import stat
 import sys
@@ -153,6 +154,7 @@ def add_common_arguments(parser: argparse.ArgumentParser, default_scene: str) ->
 def run(
     parser: argparse.ArgumentParser,
     marker: str,
+    dataparser: str,
     arguments: Optional[Sequence[str]],
     finish_of: Callable[[argparse.Namespace], Optional[Callable[[Path], None]]] = lambda options: None,
 ) -> int:
@@ -161,6 +163,7 @@ def run(
     Args:
         parser: With `add_common_arguments` and the script's own.
         marker: See `fetch_scene`.
+        dataparser: The one that reads the scene.
         arguments: None for the process's own.
         finish_of: From the options to what is done with an unpacked scene.
 
@@ -179,7 +182,8 @@ def run(
     except KeyboardInterrupt:
         print("Error: Interrupted; nothing was changed.", file=sys.stderr)
         return 1
-    print(f"Wrote {folder}")
+    command = ["ns-train", "coarse-fewshot", "--data", str(folder), dataparser]
+    print(f"Made {folder} – next: {shlex.join(command)}")
     return 0
 
 

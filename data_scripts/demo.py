@@ -390,7 +390,6 @@ def train_command(method: str, flags: List[str], scene: Path, outputs: Path, ite
     """ns-train for a sample scene, without a viewer and with a log that can be piped."""
     command = ["ns-train", method, *flags, "--data", str(scene), "--output-dir", str(outputs)]
     command += ["--vis", "tensorboard", "--viewer.quit-on-train-completion", "True"]
-    command += ["--logging.local-writer.max-log-size", "0"]
     if iterations is not None:
         command += ["--max-num-iterations", str(iterations)]
     return [*command, f"{scene.name}-data"]
@@ -441,7 +440,12 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     for heading, seconds in demo.durations:
         print(f"  {'before' if seconds is None else clock(seconds):>6}  {heading}")
     print(f"  {clock(time.monotonic() - start):>6}  in all\n")
-    print(f"Look at {(options.output / 'index.html').resolve()}")
+    viewer = [
+        "ns-viewer",
+        "--load-config",
+        str(newest_run(options.output / "outputs" / options.scene, STYLE) / "config.yml"),
+    ]
+    print(f"Made {(options.output / 'index.html').resolve()} – next: {shlex.join(viewer)}")
     return 0
 
 

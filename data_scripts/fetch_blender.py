@@ -74,7 +74,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     def finish_of(options: argparse.Namespace) -> Optional[Callable[[Path], None]]:
         return halve_scene if options.half_resolution else None
 
-    return run(parser, "transforms_train.json", arguments, finish_of)
+    return run(parser, "transforms_train.json", "blender-data", arguments, finish_of)
 
 
 if __name__ == "__main__":

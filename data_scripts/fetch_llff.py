@@ -18,7 +18,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     """The command line; `arguments` default to the process's own. Returns the exit status."""
     parser = argparse.ArgumentParser(description="Fetches a forward-facing scene in the LLFF layout.")
     add_common_arguments(parser, default_scene="fern")
-    return run(parser, "poses_bounds.npy", arguments)
+    return run(parser, "poses_bounds.npy", "llff-data", arguments)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ import argparse
 import json
 import math
 import os
+import shlex
 import shutil
 import sys
 import tempfile
@@ -1031,7 +1032,8 @@ def _write_layout(target: Path, force: bool, write: Callable[[Path], None]) -> N
         if target.exists():
             shutil.move(target, Path(temporary) / "replaced")
         os.replace(finished, target)
-    print(f"Wrote {target}")
+    command = ["ns-train", "coarse-fewshot-draft", "--data", str(target), f"{target.name}-data"]
+    print(f"Made {target} – next: {shlex.join(command)}")
 
 
 def _parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:

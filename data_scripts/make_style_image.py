@@ -13,6 +13,7 @@ upper left on that relief is what makes the strokes stand out.
 
 import argparse
 import math
+import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -369,7 +370,8 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     except (OSError, ValueError) as error:
         print(f"Error: {error}", file=sys.stderr)
         return 1
-    print(f"Wrote {options.output}")
+    command = ["ns-train", "hier-style", "--style-image", str(options.output), "--data", "SCENE", "llff-data"]
+    print(f"Made {options.output} – next: {shlex.join(command)}")
     return 0
 
 

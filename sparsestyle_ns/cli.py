@@ -8,7 +8,7 @@ import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Callable, Dict, Literal, Optional, Sequence, Tuple
+from typing import Annotated, Any, Callable, Dict, List, Literal, Optional, Sequence, Tuple
 
 import tyro
 
@@ -18,43 +18,60 @@ from sparsestyle_ns.errors import InputError, exit_on_input_error
 @exit_on_input_error
 def gallery(
     runs: Annotated[Tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")],
-    output_path: Path,
+    output_path: Path = Path("gallery.html"),
     video: Tuple[Path, ...] = (),
     title: str = "Stylised scenes",
     num_views: int = 3,
+    frames: int = 48,
+    evaluate: bool = False,
 ) -> None:
     """Makes one HTML page of stylised runs that opens without a network.
+
+    It shows photos, painting, a slider between the scene before and after, a film, settings, effects, and what
+    `sparsestyle evaluate` has left in the run's folder; of several runs also a grid of scenes and paintings.
 
     Args:
         runs: Stylised runs to show, each by its folder or its config.yml.
         output_path: The page to write.
-        video: MP4 files, as ns-render writes them, for the runs in the same order.
+        video: MP4 files, as ns-render writes them, for the runs in the same order, instead of films made here.
         title: Heading of the page.
         num_views: Held-out views to render of each run.
+        frames: Frames of a film, 16 a second; 0 for none. In a scene with photos from all around it is a turn about
+            it, else a flight through the photos' viewpoints.
+        evaluate: Measure runs that have no evaluation.json of their newest checkpoint, and leave them one.
     """
-    from sparsestyle_ns.gallery import collect_run, prepare_folder, read_video, write_page
+    from sparsestyle_ns.gallery.page import gallery_page, read_film
+    from sparsestyle_ns.page import prepare_page, write_page
     from sparsestyle_ns.run_folder import STYLE_METHOD, find_config
 
     if not runs:
         raise InputError("There is no run to show; name at least one run's folder.")
     if len(video) > len(runs):
         raise InputError(f"There are {len(video)} videos for {len(runs)} runs; give at most one for each run.")
+    if frames < 0:
+        raise InputError(f"--frames is {frames}; give 0 for no film, or more.")
     configs = [find_config(run, STYLE_METHOD) for run in runs]
     for path in video:
-        read_video(path)
-    prepare_folder(output_path)  # rendering takes minutes, so what can fail without it fails before
+        read_film(path)
+    prepare_page(output_path)  # rendering takes minutes, so what can fail without it fails before
+    from sparsestyle_ns.gallery.collect import collect_run
+    from sparsestyle_ns.next_command import finish
+    from sparsestyle_ns.progress import say
+
     videos = [*video, *[None] * (len(runs) - len(video))]
     pictures = []
     for config, path in zip(configs, videos, strict=True):
-        print(f"Rendering views of {config.parent} …", flush=True)
-        pictures.append(collect_run(config, path, num_views))
-    print(f"The page is {write_page(pictures, output_path, title)}")
+        say(f"Showing {config.parent}")
+        pictures.append(collect_run(config, path, num_views, frames, evaluate))
+    page = write_page(gallery_page(pictures, title), output_path)
+    run = configs[0].parent
+    finish(page, ["sparsestyle", "export", run, "--format", "html", "--output-path", "scene.html"])
 
 
 @exit_on_input_error
 def evaluate(
     run: Annotated[Path, tyro.conf.Positional],
-    output_path: Path,
+    output_path: Optional[Path] = None,
     style_image: Optional[Path] = None,
     baked: bool = False,
 ) -> None:
@@ -66,18 +83,26 @@ def evaluate(
 
     Args:
         run: The run's folder or its config.yml.
-        output_path: JSON file to write, in the layout of ns-eval.
-        style_image: Painting to measure a stylised run against, if not the one it was made with.
+        output_path: JSON file to write, in the layout of ns-eval; left out, evaluation.json in the run's folder.
+        style_image: Painting to measure a stylised run against, if not the one it was made with; needs --output-path.
         baked: Also measure how close a stylised run's baked renders are to exact ones (PSNR in dB).
     """
+    from sparsestyle_ns.output_file import prepare_output
+    from sparsestyle_ns.run_folder import REPORT_FILE, find_config
+
+    config = find_config(run)
+    if output_path is None and style_image is not None:
+        raise InputError(f"{REPORT_FILE} in the run's folder is for its own painting; name a file with --output-path.")
+    path = output_path or config.parent / REPORT_FILE
+    prepare_output(path, "The report", "report.json")  # measuring takes minutes, so what can fail fails before
     from sparsestyle_ns.evaluation.held_out import evaluate_run
     from sparsestyle_ns.evaluation.tables import report_tables
-    from sparsestyle_ns.run_folder import find_config
+    from sparsestyle_ns.next_command import after_evaluation, finish
 
-    report = evaluate_run(find_config(run), output_path, style_image, baked)
+    report = evaluate_run(config, path, style_image, baked)
     for table in report_tables(report.means, len(report.views)):
         table.print()
-    print(f"{len(report.views)} held-out views; the report is {output_path}")
+    finish(path, after_evaluation(config.parent, stylised="content_ssim" in report.means))
 
 
 @exit_on_input_error
@@ -104,10 +129,13 @@ def effects(
     from contextlib import redirect_stdout
 
     from sparsestyle_ns.effects.command import measure_scene
+    from sparsestyle_ns.next_command import after_effects, finish
 
     with redirect_stdout(sys.stderr):  # what dataparsers have to say must not get into the JSON
         decisions = measure_scene(dataparser, data, num_views, view_ids, coarse_run, style_image)
-    print(decisions.json() if json else decisions.text())
+    print(decisions.json() if json else decisions.text(), flush=True)
+    with redirect_stdout(sys.stderr if json else sys.stdout):
+        finish(None, after_effects(dataparser, data, num_views, view_ids, coarse_run, style_image))
 
 
 @exit_on_input_error
@@ -216,8 +244,9 @@ def compare(options: Annotated[StudyOptions, tyro.conf.arg(name="")]) -> None:
     Interrupted, the same command goes on where it was.
     """
     from sparsestyle_ns.evaluation.comparison import compare as run
+    from sparsestyle_ns.next_command import study_arguments
 
-    _write_study(options, run, "Comparison")
+    _write_study(options, run, "Comparison", lambda given, _: ["sparsestyle", "ablate", *study_arguments(given)])
 
 
 @exit_on_input_error
@@ -230,14 +259,25 @@ def ablate(options: Annotated[StudyOptions, tyro.conf.arg(name="")]) -> None:
     """
     from sparsestyle_ns.evaluation.ablations import ablate as run
 
-    _write_study(options, run, "Ablations")
+    _write_study(options, run, "Ablations", lambda _, stylised: ["sparsestyle", "gallery", *stylised])
 
 
-def _write_study(options: StudyOptions, run: Callable[..., Any], title: str) -> None:
+def _write_study(
+    options: StudyOptions,
+    run: Callable[..., Any],
+    title: str,
+    next_command: Callable[[StudyOptions, List[Path]], List[object]],
+) -> None:
+    """Runs a study, prints its tables and writes its page.
+
+    Args:
+        next_command: what to type next, from the options and the folders of our own stylised runs.
+    """
     from sparsestyle_ns.evaluation.experiments import Laboratory, SceneSettings
     from sparsestyle_ns.evaluation.study import Study
     from sparsestyle_ns.evaluation.study_page import write_study
-    from sparsestyle_ns.gallery import prepare_folder
+    from sparsestyle_ns.next_command import finish
+    from sparsestyle_ns.page import prepare_page
     from sparsestyle_ns.style.image import load_style_image
 
     if not options.data.exists():
@@ -248,7 +288,7 @@ def _write_study(options: StudyOptions, run: Callable[..., Any], title: str) -> 
         raise InputError(f"--jobs is {options.jobs}; at least one run at a time is needed.")
     for painting in options.style_images:
         load_style_image(painting)
-    prepare_folder(options.output_path)
+    prepare_page(options.output_path)
     side = options.max_image_side
     scene = SceneSettings(
         options.data,
@@ -268,7 +308,8 @@ def _write_study(options: StudyOptions, run: Callable[..., Any], title: str) -> 
     for section in sections:
         for table in section.tables:
             table.print()
-    print(f"The page is {write_study(sections, options.output_path, f'{title}: {scene.name}')}")
+    page = write_study(sections, options.output_path, f"{title}: {scene.name}")
+    finish(page, next_command(options, [study.stylised(painting).folder(scene) for painting in options.style_images]))
 
 
 @exit_on_input_error
@@ -302,6 +343,7 @@ def export(
         output_path, "The scene", example
     )  # rendering takes minutes, so what can fail without it fails before
     from sparsestyle_ns.export.command import export_mesh, export_page, export_points, load_scene
+    from sparsestyle_ns.next_command import after_export, finish
 
     scene = load_scene(config)
     if format == "html":
@@ -310,7 +352,7 @@ def export(
         export_points(scene, output_path)
     else:
         export_mesh(scene, output_path)
-    print(f"The scene is {output_path.resolve()}")
+    finish(output_path.resolve(), after_export(run, output_path, format))
 
 
 @exit_on_input_error
@@ -333,8 +375,10 @@ def prepare(
     from sparsestyle_ns.prepare.command import prepare_scene
 
     scene = prepare_scene(photos, output, poses)
-    print(f"{scene.folder} has {len(scene.names)} photos with poses")
-    print(f"Next: ns-train coarse-fewshot --data {scene.folder} {scene.parser}")
+    from sparsestyle_ns.next_command import finish
+
+    made = f"{scene.folder}, {len(scene.names)} photos with poses"
+    finish(made, ["ns-train", "coarse-fewshot", "--data", scene.folder, scene.parser])
 
 
 SUBCOMMANDS: Dict[str, Callable[..., Any]] = {

@@ -1,6 +1,6 @@
 """The methods that this package adds to nerfstudio: the paper's settings, and drafts for small machines."""
 
-from nerfstudio.configs.base_config import LoggingConfig, ViewerConfig
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, ViewerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig, MultiStepSchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -19,6 +19,11 @@ from sparsestyle_ns.trainer import (
 )
 
 
+def _logging(steps_per_log: int) -> LoggingConfig:
+    """Without nerfstudio's table and its profile at the end: the trainer has a bar and a last line of its own."""
+    return LoggingConfig(steps_per_log=steps_per_log, local_writer=LocalWriterConfig(enable=False), profiler="none")
+
+
 def _coarse_fewshot(draft: bool) -> TrainerConfig:
     """Stage 1; the draft is for images of about 128 pixels and two CPU cores."""
     iterations = 2500 if draft else 50_000
@@ -28,7 +33,7 @@ def _coarse_fewshot(draft: bool) -> TrainerConfig:
         max_num_iterations=iterations,
         steps_per_save=1000 if draft else 5000,
         steps_per_eval_batch=0,
-        steps_per_eval_image=1000 if draft else 5000,
+        steps_per_eval_image=0,
         steps_per_eval_all_images=0,
         pipeline=CoarseFewShotPipelineConfig(
             datamanager=FewShotDataManagerConfig(
@@ -44,7 +49,7 @@ def _coarse_fewshot(draft: bool) -> TrainerConfig:
             }
         },
         viewer=ViewerConfig(num_rays_per_chunk=1 << 13),
-        logging=LoggingConfig(steps_per_log=50 if draft else 100),
+        logging=_logging(50 if draft else 100),
         vis="viewer+tensorboard",
     )
 
@@ -57,7 +62,7 @@ def _hier_style(draft: bool) -> TrainerConfig:
         max_num_iterations=200,
         steps_per_save=50,
         steps_per_eval_batch=0,
-        steps_per_eval_image=100,
+        steps_per_eval_image=0,
         steps_per_eval_all_images=0,
         pipeline=HierStylePipelineConfig(
             datamanager=FewShotDataManagerConfig(max_image_side=128 if draft else 1008),
@@ -80,7 +85,7 @@ def _hier_style(draft: bool) -> TrainerConfig:
             }
         },
         viewer=ViewerConfig(num_rays_per_chunk=1 << 13),
-        logging=LoggingConfig(steps_per_log=5),
+        logging=_logging(5),
         vis="viewer+tensorboard",
     )
 

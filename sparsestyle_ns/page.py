@@ -1,6 +1,24 @@
 """What HTML pages of this package have in common: one file that needs nothing else, light or dark."""
 
+import base64
+import io
 from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Collection, Optional, Sequence
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from sparsestyle_ns.output_file import prepare_output, write_output
+
+Pixels = UInt8[np.ndarray, "H W 3"]
+
+LOSSLESS_PIXELS = 200_000
+"""Pictures with at most this many pixels go into a page as PNG, larger ones as JPEG."""
+EXAMPLE_NAME = "index.html"
+"""A good name for a page."""
 
 CONTENT_POLICY = (
     "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
@@ -52,3 +70,78 @@ def html_page(title: str, style: str, body: str) -> str:
         f"<title>{escape(title)}</title>\n<style>{BASE_STYLE}{style}</style>\n</head>\n<body>\n"
         f"{body}\n</body>\n</html>\n"
     )
+
+
+def picture_page(title: str, contents: str, sections: str, style: str = "", script: str = "") -> str:
+    """A whole page of sections with pictures and tables.
+
+    Args:
+        title: its heading, plain text.
+        contents: HTML below the heading.
+        sections: HTML of its body.
+        style: rules beside those of pictures and tables.
+        script: what it does.
+    """
+    body = f'<header class="top"><h1>{escape(title)}</h1>{contents}</header>\n<main>\n{sections}</main>' + (
+        f"\n<script>{script}</script>" if script else ""
+    )
+    shared = (files("sparsestyle_ns") / "page.css").read_text(encoding="utf-8")
+    return html_page(title, shared + style, body)
+
+
+def image(pixels: Pixels, alternative: str, name: str = "") -> str:
+    """A picture as HTML, of a class `name` if there is one; the alternative text is plain."""
+    height, width = pixels.shape[:2]
+    names = f' class="{name}"' if name else ""
+    return f'<img{names} src="{data_uri(pixels)}" width="{width}" height="{height}" alt="{escape(alternative)}">'
+
+
+def figure(pixels: Pixels, caption: str, alternative: Optional[str] = None) -> str:
+    """A picture with its caption, as HTML; both texts are plain."""
+    return f"<figure>{image(pixels, alternative or caption)}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def data_uri(pixels: Pixels) -> str:
+    """A picture as a data URI: PNG, or JPEG where PNG would be heavy."""
+    lossless = pixels.shape[0] * pixels.shape[1] <= LOSSLESS_PIXELS
+    buffer = io.BytesIO()
+    if lossless:
+        Image.fromarray(pixels).save(buffer, "PNG", optimize=True)
+    else:
+        Image.fromarray(pixels).save(buffer, "JPEG", quality=90)
+    return f"data:image/{'png' if lossless else 'jpeg'};base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]], cited: Collection[str] = ()) -> str:
+    """A table of plain texts as HTML; rows whose first cell is in `cited` are marked as others' figures."""
+    heads = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
+    body = ""
+    for row in rows:
+        mark = " class=cited" if row[0] in cited else ""
+        body += f"<tr{mark}>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>"
+    return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def prepare_page(output_path: Path) -> None:
+    """Makes the folder that a page is to be written to.
+
+    Raises:
+        InputError: it can't be made or written to, or the page's name is that of a folder.
+    """
+    prepare_output(output_path, "The page", EXAMPLE_NAME)
+
+
+def write_page(page: str, output_path: Path) -> Path:
+    """Writes a page; the file appears under its name only when it is whole.
+
+    Args:
+        page: its HTML.
+        output_path: the file; folders on the way to it are made.
+
+    Returns:
+        The file's absolute path.
+
+    Raises:
+        InputError: it can't be written there.
+    """
+    return write_output(output_path, page.encode(), "The page", EXAMPLE_NAME)

@@ -12,6 +12,10 @@ STYLE_METHOD = "hier-style"
 """What the names of stage 2's methods start with."""
 
 
+REPORT_FILE = "evaluation.json"
+"""What was measured of a run, in its folder."""
+
+
 def find_config(run: Path, method: str = "") -> Path:
     """The config.yml of a run, given by its folder or by that file; reads no more than its method's name.
 

@@ -3,9 +3,10 @@
 import copy
 import signal
 import warnings
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Dict, List, Literal, Optional, Tuple, Type
+from typing import Any, ClassVar, Dict, List, Literal, Optional, Tuple, Type
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
-from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.decorators import check_main_thread, check_viewer_enabled
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sparsestyle_ns.coarse_run import (
@@ -32,7 +33,10 @@ from sparsestyle_ns.errors import InputError, exit_on_input_error
 from sparsestyle_ns.files import write_whole
 from sparsestyle_ns.finite_steps import FiniteOptimizers
 from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
+from sparsestyle_ns.next_command import finish, ns_train_style, resume_command
+from sparsestyle_ns.preview import preview_steps, render_preview, save_preview
 from sparsestyle_ns.processes import any_process, from_first_process, prepare_launch, share_state
+from sparsestyle_ns.progress import bar, say
 from sparsestyle_ns.scene_record import record_scene
 from sparsestyle_ns.style.image import load_style_image
 
@@ -65,6 +69,9 @@ class SparseStyleTrainerConfig(TrainerConfig):
     max_skipped_steps: int = 20
     """Iterations in a row, at least 1, whose gradient isn't finite and whose step is therefore skipped, after which
     training stops."""
+    previews: Tuple[float, ...] = (0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
+    """Shares of the iterations, in (0, 1], after which a held-out view is rendered, into the folder previews of the run
+    and into tensorboard where it is on; none: --previews alone."""
 
     @exit_on_input_error
     def save_config(self) -> None:
@@ -90,6 +97,8 @@ class SparseStyleTrainer(Trainer):
 
     config: SparseStyleTrainerConfig
     optimizers: FiniteOptimizers
+    stage: ClassVar[str]
+    """What its bar is called."""
 
     def __init__(self, config: SparseStyleTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         super().__init__(config, local_rank, world_size)
@@ -100,6 +109,7 @@ class SparseStyleTrainer(Trainer):
         """Sets up the run and records what it is trained on, and which effects are simulated."""
         if self.config.max_skipped_steps < 1:
             raise InputError(f"--max-skipped-steps is {self.config.max_skipped_steps}; give 1 or more.")
+        self._preview_steps = preview_steps(self.config.previews, self._total)
         self._reported = 0
         self._kept_step: Optional[int] = None
         checkpoint = self.resumed_checkpoint()
@@ -164,6 +174,11 @@ class SparseStyleTrainer(Trainer):
 
     @exit_on_input_error
     def train(self) -> None:
+        """Trains, and says what was made and what to type next."""
+        self.train_to_end()
+        self.finish()
+
+    def train_to_end(self) -> None:
         """Trains up to `max_num_iterations`, counted from the very first iteration, also when resuming.
 
         Ctrl-C ends training after the iteration that is under way and saves a checkpoint; a second one stops at once.
@@ -177,15 +192,31 @@ class SparseStyleTrainer(Trainer):
         self._interrupted = False
         former = signal.signal(signal.SIGINT, self._on_interrupt)
         self.config.max_num_iterations = total - self._start_step
+        has_table = self.config.logging.local_writer.enable  # nerfstudio's, which would write over the bar
         try:
-            super().train()
+            with ExitStack() as self._bars:
+                shown = bar(self.stage, total, self._start_step, "iterations", visible=not has_table)
+                self._bar = self._bars.enter_context(shown)
+                super().train()
         except TrainingInterruptedError:
             self.save_checkpoint(self.step)
             CONSOLE.print(f"Stopped after iteration {self.step + 1} of {total}; the checkpoint is saved.")
         finally:
             self.config.max_num_iterations = total
             signal.signal(signal.SIGINT, former)
-        self.report(interrupted=self._interrupted)
+
+    def _after_train(self) -> None:
+        self._bars.close()  # a viewer may stay open for hours after training
+        super()._after_train()
+
+    @check_viewer_enabled
+    def _train_complete_viewer(self) -> None:
+        """The viewer stays until Ctrl-C, with which the command ends as well as without a viewer."""
+        self.finish()
+        try:
+            super()._train_complete_viewer()
+        except KeyboardInterrupt:
+            CONSOLE.print("The viewer is closed.")
 
     def _on_interrupt(self, number: int, frame: Any) -> None:
         if self._interrupted or self.training_state != "training":
@@ -201,6 +232,10 @@ class SparseStyleTrainer(Trainer):
             InputError: the gradients of too many iterations in a row weren't finite.
         """
         result = super().train_iteration(step)
+        note = None
+        if (step + 1) % self.config.logging.steps_per_log == 0:  # reading the values waits for a GPU
+            note = ", ".join(f"{name} {float(value):.3g}" for name, value in result[2].items())
+        self._bar.advance(note=note)
         if (step + 1) % STEPS_PER_LOOK == 0:
             self._look_at_skipped(step)
         self._interrupted = any_process(self._interrupted, self.pipeline.device)
@@ -228,21 +263,32 @@ class SparseStyleTrainer(Trainer):
             )
         return in_a_row
 
-    def report(self, interrupted: bool) -> None:
-        """Prints what was made and what to type next."""
-        config = self.base_dir / "config.yml"
-        CONSOLE.print(f"\nSaved in {self.base_dir}", soft_wrap=True)
-        if interrupted:
-            CONSOLE.print(
-                f"Go on with: ns-train {self.config.method_name} --load-dir {self.checkpoint_dir} …", soft_wrap=True
-            )
-            return
-        for line in self.next_commands(config):
-            CONSOLE.print(f"Next: {line}", soft_wrap=True)
+    def eval_iteration(self, step: int) -> None:
+        """What nerfstudio evaluates after an iteration, and the preview after some."""
+        if step + 1 in self._preview_steps:
+            self._write_preview(step + 1)
+        super().eval_iteration(step)
 
-    def next_commands(self, config: Path) -> List[str]:
-        """Commands that use the finished run."""
-        return [f"ns-viewer --load-config {config}"]
+    @check_main_thread
+    def _write_preview(self, iterations: int) -> None:
+        picture = render_preview(self.pipeline)
+        writer.put_image(name="Preview", image=picture, step=iterations)
+        try:
+            save_preview(picture, self.base_dir, iterations)
+        except OSError as error:
+            say(f"The preview after {iterations} iterations can't be saved ({error.strerror}); training goes on.")
+
+    def finish(self) -> None:
+        """Prints the command's last line."""
+        if self._interrupted:
+            made = f"{self.base_dir}, up to iteration {self.step + 1} of {self._total}"
+            finish(made, resume_command(self.config.method_name, self.checkpoint_dir))
+        else:
+            finish(self.base_dir, self.next_command())
+
+    def next_command(self) -> List[str]:
+        """A command that uses the finished run."""
+        raise NotImplementedError
 
     def notes(self) -> Dict[str, Any]:
         """What a checkpoint says beside the state: numbers and words only."""
@@ -336,13 +382,11 @@ class TrainingInterruptedError(Exception):
 class CoarseFewShotTrainer(SparseStyleTrainer):
     """The trainer of stage 1."""
 
-    def next_commands(self, config: Path) -> List[str]:
-        """See `SparseStyleTrainer.next_commands`."""
-        style = self.config.method_name.replace("coarse-fewshot", "hier-style")
-        return [
-            f"ns-train {style} --style-image PAINTING.jpg --coarse-run {self.base_dir} --data {self.config.data} …",
-            *super().next_commands(config),
-        ]
+    stage = "Stage 1"
+
+    def next_command(self) -> List[str]:
+        """See `SparseStyleTrainer.next_command`."""
+        return ns_train_style(self.base_dir, self.config)
 
 
 @dataclass
@@ -354,6 +398,8 @@ class HierStyleTrainerConfig(SparseStyleTrainerConfig):
 
 class HierStyleTrainer(SparseStyleTrainer):
     """The trainer of stage 2: finds or trains the coarse run first."""
+
+    stage = "Stage 2"
 
     @exit_on_input_error
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
@@ -464,7 +510,7 @@ class HierStyleTrainer(SparseStyleTrainer):
         self._write_config(config)
         trainer = config.setup(local_rank=self.local_rank, world_size=self.world_size)
         trainer.setup()
-        trainer.train()
+        trainer.train_to_end()
         if trainer._interrupted:
             raise InputError(
                 "The coarse run was interrupted, so there is nothing to stylise yet; run the command again."
@@ -474,9 +520,6 @@ class HierStyleTrainer(SparseStyleTrainer):
         from_first_process(None)  # the others wait here until it has saved
         return read_coarse_run(trainer.base_dir)
 
-    def next_commands(self, config: Path) -> List[str]:
-        """See `SparseStyleTrainer.next_commands`."""
-        return [
-            f"ns-render interpolate --load-config {config} --rendered-output-names rgb --output-path stylised.mp4",
-            *super().next_commands(config),
-        ]
+    def next_command(self) -> List[str]:
+        """See `SparseStyleTrainer.next_command`."""
+        return ["sparsestyle", "gallery", str(self.base_dir)]

@@ -6,8 +6,9 @@ import sys
 
 import pytest
 
-from sparsestyle_ns import gallery as gallery_module
 from sparsestyle_ns.cli import SUBCOMMANDS, main
+from sparsestyle_ns.gallery import collect
+from sparsestyle_ns.gallery import page as gallery_page
 
 
 def run_main(arguments, capsys):
@@ -42,6 +43,7 @@ def test_help_loads_neither_torch_nor_nerfstudio():
         ([], "Error: There is no run to show;"),
         (["{tmp}/run", "--video", "{tmp}/1.mp4", "{tmp}/2.mp4"], "Error: There are 2 videos for 1 runs;"),
         (["{tmp}/run", "--video", "{tmp}/gone.mp4"], "Error: The video {tmp}/gone.mp4 can't be read"),
+        (["{tmp}/run", "--frames", "-1"], "Error: --frames is -1;"),
         (["{tmp}/run", "--output-path", "{tmp}"], "Error: --output-path {tmp} is a folder;"),
         (["{tmp}/run", "--output-path", "{tmp}/run/config.yml/page.html"], "Error: The page can't be written to"),
     ],
@@ -80,11 +82,20 @@ def test_gallery_gives_each_run_its_video_and_says_last_where_the_page_is(tmp_pa
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.yml").write_text("method_name: hier-style\n")
     pages = []
-    monkeypatch.setattr(gallery_module, "collect_run", lambda *given: given)
-    monkeypatch.setattr(gallery_module, "write_page", lambda *given: pages.append(given) or given[1])
+    monkeypatch.setattr(collect, "collect_run", lambda *given: given)
+    monkeypatch.setattr(gallery_page, "gallery_page", lambda *given: pages.append(given) or "<html>")
     target = tmp_path / "page.html"
     given = [str(tmp_path / "first"), str(tmp_path / "second" / "config.yml"), "--output-path", str(target)]
-    main(["gallery", *given, "--video", str(film), "--title", "Two scenes", "--num-views", "2"])
-    runs = [(tmp_path / "first" / "config.yml", film, 2), (tmp_path / "second" / "config.yml", None, 2)]
-    assert pages == [(runs, target, "Two scenes")]
-    assert capsys.readouterr().out.splitlines()[-1] == f"The page is {target}"
+    main(["gallery", *given, "--video", str(film), "--title", "Two scenes", "--num-views", "2", "--frames", "0"])
+    runs = [(tmp_path / "first" / "config.yml", film, 2, 0, False)]
+    runs.append((tmp_path / "second" / "config.yml", None, 2, 0, False))
+    assert pages == [(runs, "Two scenes")]
+    assert target.read_text() == "<html>"
+    export = f"sparsestyle export {tmp_path / 'first'} --format html --output-path scene.html"
+    assert capsys.readouterr().out.splitlines()[-1] == f"Made {target} – next: {export}"
+
+
+def test_another_painting_is_not_measured_into_the_runs_own_report(tmp_path, capsys):
+    (tmp_path / "config.yml").write_text("method_name: hier-style\n")
+    message, _ = run_main(["evaluate", str(tmp_path), "--style-image", "other.jpg"], capsys)
+    assert message.startswith("Error: evaluation.json in the run's folder is for its own painting;")

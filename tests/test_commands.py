@@ -260,7 +260,10 @@ def test_ctrl_c_leaves_a_checkpoint_that_renders(
     ns_train("coarse-fewshot", llff_scene, tmp_path / "outputs", "--max-num-iterations", "50", *TINY)
     run = only_run(tmp_path / "outputs", "coarse-fewshot")
     assert load(run)["step"] == 2
-    assert "Stopped after iteration 3 of 50" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "Stopped after iteration 3 of 50" in printed
+    resume = f"ns-train coarse-fewshot --load-dir {run / 'nerfstudio_models'} --data {llff_scene}"
+    assert printed.splitlines()[-1].startswith(f"Made {run}, up to iteration 3 of 50 – next: {resume}")
     render("dataset", run, tmp_path / "pictures", "--split", "test", "--rendered-output-names", "rgb")
     assert len(list((tmp_path / "pictures").rglob("*.jpg"))) == 2
 

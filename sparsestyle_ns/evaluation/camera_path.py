@@ -1,4 +1,7 @@
-"""The one path of cameras on which consistency is measured: fixed by the training cameras, without chance or choice."""
+"""Paths of cameras that are fixed by the training cameras, without chance or choice.
+
+One is that on which consistency is measured; the other, made of the same pieces, shows a scene in a film.
+"""
 
 import itertools
 import math
@@ -18,10 +21,12 @@ ARC_STEP = math.radians(2.0)
 """Angle between neighbouring frames of an arc."""
 FACING = math.cos(math.radians(60.0))
 """Cameras all of whose view directions are at least this close (cosine) to their mean look one way."""
+FLIGHT_STEPS = 20
+"""Poses of a flight that a frame chooses from, so that its speed can change without jerks."""
 
 
 def measuring_path(cameras: Cameras) -> Cameras:
-    """The path's cameras, one a frame, with the first training camera's lens, undistorted.
+    """The measuring path's cameras, one a frame, with the first training camera's lens, undistorted.
 
     Where the training cameras look one way, the path leads from each to the next in their order, in steps of equal
     parts; where they stand all around, it is an arc around the point that they look at, level with them on average,
@@ -36,9 +41,35 @@ def measuring_path(cameras: Cameras) -> Cameras:
     if len(cameras) < 2:
         raise InputError("Consistency is measured between training views, and there is one; train on two or more.")
     poses = cameras.camera_to_worlds.cpu().float()
+    return _along(poses_between(poses) if look_one_way(poses) else poses_around(poses), cameras)
+
+
+def showing_path(cameras: Cameras, frames: int) -> Cameras:
+    """A closed path that shows a scene, one camera a frame, with the first training camera's lens, undistorted.
+
+    Where the training cameras look one way, a flight through them there and back, which is slow where it turns; where
+    they stand all around, one full turn about the point that they look at, level with them on average.
+
+    Args:
+        cameras: the training cameras, two or more.
+        frames: how many; the last is just before the first.
+    """
+    poses = cameras.camera_to_worlds.cpu().float()
+    if not look_one_way(poses):
+        return _along(poses_around(poses, 2.0 * math.pi / frames, frames), cameras)
+    fine = poses_between(poses, FLIGHT_STEPS * frames)
+    place = 0.5 - 0.5 * torch.cos(torch.arange(frames) * (2.0 * math.pi / frames))
+    return _along(fine[(place * (len(fine) - 1)).round().long()], cameras)
+
+
+def look_one_way(poses: Float[Tensor, "cameras 3 4"]) -> bool:
+    """Whether no camera looks farther than `FACING` aside from the mean direction."""
     forward = -poses[:, :, 2]
     mean = torch.nn.functional.normalize(forward.mean(dim=0), dim=0)
-    path = poses_between(poses) if bool((forward @ mean > FACING).all()) else poses_around(poses)
+    return bool((forward @ mean > FACING).all())
+
+
+def _along(path: Float[Tensor, "frames 3 4"], cameras: Cameras) -> Cameras:
     count = len(path)
     return Cameras(
         camera_to_worlds=path.to(cameras.camera_to_worlds),
@@ -46,9 +77,9 @@ def measuring_path(cameras: Cameras) -> Cameras:
     )
 
 
-def poses_between(poses: Float[Tensor, "cameras 3 4"]) -> Float[Tensor, "frames 3 4"]:
-    """Poses from each camera to the next; equally many, `NUM_FRAMES` at least in all, in each gap."""
-    steps = -(-(NUM_FRAMES - 1) // (len(poses) - 1))
+def poses_between(poses: Float[Tensor, "cameras 3 4"], frames: int = NUM_FRAMES) -> Float[Tensor, "all 3 4"]:
+    """Poses from each camera to the next; equally many, `frames` at least in all, in each gap."""
+    steps = -(-(frames - 1) // (len(poses) - 1))
     path: List[Tensor] = [poses[0]]
     for first, second in itertools.pairwise(poses):
         between = get_interpolated_poses(first.numpy(), second.numpy(), steps + 1)
@@ -56,16 +87,18 @@ def poses_between(poses: Float[Tensor, "cameras 3 4"]) -> Float[Tensor, "frames 
     return torch.stack(path)
 
 
-def poses_around(poses: Float[Tensor, "cameras 3 4"]) -> Float[Tensor, "frames 3 4"]:
-    """An arc of `NUM_FRAMES` poses around the point closest to all optical axes, with z up."""
+def poses_around(
+    poses: Float[Tensor, "cameras 3 4"], step: float = ARC_STEP, frames: int = NUM_FRAMES
+) -> Float[Tensor, "frames 3 4"]:
+    """An arc of so many poses, `step` radians apart, around the point closest to all optical axes, with z up."""
     center = axes_meet(poses)
     offsets = poses[:, :, 3] - center
     height = offsets[:, 2].mean()
     radius = offsets[:, :2].norm(dim=-1).mean()
     start = torch.atan2(offsets[0, 1], offsets[0, 0])
-    angles = start + ARC_STEP * torch.arange(NUM_FRAMES, dtype=poses.dtype)
+    angles = start + step * torch.arange(frames, dtype=poses.dtype)
     positions = center + torch.stack(
-        [radius * torch.cos(angles), radius * torch.sin(angles), height.expand(NUM_FRAMES)], dim=-1
+        [radius * torch.cos(angles), radius * torch.sin(angles), height.expand(frames)], dim=-1
     )
     back = torch.nn.functional.normalize(positions - center, dim=-1)
     right = torch.nn.functional.normalize(torch.linalg.cross(back.new_tensor([[0.0, 0.0, 1.0]]), back), dim=-1)

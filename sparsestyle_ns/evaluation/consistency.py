@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sparsestyle_ns.evaluation.image_metrics import lpips_metric, st_lpips_metric
 from sparsestyle_ns.evaluation.warping import Correspondence, Surface, correspond, sample_picture
+from sparsestyle_ns.progress import track
 
 RANGES = {"short": 1, "long": 7}
 """Frames between the two views of a pair, as in Stylos and Styl3R."""
@@ -103,7 +104,10 @@ class PathGeometry:
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
         self.pairs = {
-            name: [correspond(surfaces[t], surfaces[t + gap]) for t in range(len(surfaces) - gap)]
+            name: [
+                correspond(surfaces[t], surfaces[t + gap])
+                for t in track(range(len(surfaces) - gap), f"Matching frames, {name} range")
+            ]
             for name, gap in RANGES.items()
         }
 
@@ -116,9 +120,9 @@ class PathGeometry:
         """`short_rmse`, `short_ssim` …, `long_rmse` …: means over all pairs of the range that share a pixel."""
         means = {}
         for name, gap in RANGES.items():
+            pairs = track(self.pairs[name], f"Consistency, {name} range")
             values = [
-                pair_consistency(frames[t], frames[t + gap], correspondence)
-                for t, correspondence in enumerate(self.pairs[name])
+                pair_consistency(frames[t], frames[t + gap], correspondence) for t, correspondence in enumerate(pairs)
             ]
             means.update({f"{name}_{key}": value for key, value in _means(values).items()})
         return means

@@ -19,10 +19,13 @@ from typing import Callable, Dict, List, Optional, Sequence, Tuple
 
 from sparsestyle_ns.coarse_run import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.progress import Bar, bar, duration, say
 
 SECONDS_FILE = "training_seconds.json"
 CORES_PER_JOB = 4
 """CPU cores that a run makes good use of."""
+SECONDS_BETWEEN_LOOKS = 2.0
+"""At the log of a run, to see how far it is."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +125,7 @@ class Laboratory:
 
     scene: SceneSettings
     jobs: Optional[int] = None
-    say: Callable[[str], None] = lambda line: print(line, flush=True)
+    say: Callable[[str], None] = say
     _log_folder: Path = field(init=False)
     _one_at_a_time: threading.Lock = field(init=False, default_factory=threading.Lock)
 
@@ -213,8 +216,11 @@ class Laboratory:
         self.say(f"{folder.name}: iterations {done} to {iterations}; the log is {log}")
         with log.open("a") as output:
             command = experiment.command(self.scene, iterations)
-            with subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment) as process:
-                self._watch(process, folder.name, log, log.stat().st_size, start)
+            with (
+                bar(folder.name, iterations, done, "iterations") as run,
+                subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment) as process,
+            ):
+                self._watch(process, log, log.stat().st_size, run)
         if process.returncode != 0 or experiment.steps_done(self.scene) < iterations:
             last = log.read_text(errors="replace").strip().splitlines()[-1:]
             raise InputError(f"The run {folder.name} didn't finish ({' '.join(last)}); all it said is in {log}.")
@@ -222,22 +228,18 @@ class Laboratory:
         self.say(f"{folder.name}: {iterations - done} iterations in {duration(seconds)}")
         self._record(folder / SECONDS_FILE, seconds, iterations - done)
 
-    def _watch(self, process: subprocess.Popen, name: str, log: Path, begin: int, start: float) -> None:
-        """Waits for a run, and says every minute how far it is and how long it still takes."""
-        said = start
+    def _watch(self, process: subprocess.Popen, log: Path, begin: int, run: Bar) -> None:
+        """Waits for a run, and shows how far it is by what it says itself."""
         while process.poll() is None:
             try:
-                process.wait(timeout=2)
+                process.wait(timeout=SECONDS_BETWEEN_LOOKS)
             except KeyboardInterrupt:  # the run got it too, and saves what it has
                 process.wait()
                 raise
             except subprocess.TimeoutExpired:
-                if time.monotonic() - said >= 60:
-                    said = time.monotonic()
-                    share = progress(log.read_bytes()[begin:].decode(errors="replace"))
-                    if share:
-                        left = (said - start) * (1 - share) / share
-                        self.say(f"{name}: {share:.0%}, about {duration(left)} left")
+                share = share_done(log.read_bytes()[begin:].decode(errors="replace"))
+                if share is not None:
+                    run.reach(share * run.task.total)
 
     @staticmethod
     def _record(path: Path, seconds: float, iterations: int) -> None:
@@ -246,15 +248,7 @@ class Laboratory:
         path.write_text(json.dumps(record) + "\n")
 
 
-def progress(log: str) -> Optional[float]:
-    """The share in [0, 1] that nerfstudio's log says is done; None where it says nothing yet."""
-    found = re.findall(r"\((\d+(?:\.\d+)?)%\)", log)
+def share_done(log: str) -> Optional[float]:
+    """The share in [0, 1] of its iterations that a run's log says are done; None where it says nothing yet."""
+    found = re.findall(r"^Stage \d: .*\((\d+)%\)", log, flags=re.MULTILINE)
     return float(found[-1]) / 100 if found else None
-
-
-def duration(seconds: float) -> str:
-    """Seconds as minutes and seconds, or hours and minutes."""
-    whole = round(seconds)
-    if whole >= 3600:
-        return f"{whole // 3600} h {whole % 3600 // 60} min"
-    return f"{whole // 60}:{whole % 60:02d} min"

@@ -9,7 +9,6 @@ from typing import Any, Dict, List, Optional
 
 import torch
 from jaxtyping import Float
-from rich.progress import track
 from torch import Tensor
 from torchvision.utils import save_image
 
@@ -22,11 +21,12 @@ from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
+from sparsestyle_ns.progress import track
 from sparsestyle_ns.rendering.compositing import dense_weights, effective_samples, optical_depth
 from sparsestyle_ns.rendering.density_grid import interval_lengths
 from sparsestyle_ns.rendering.precision import autocast
 from sparsestyle_ns.rendering.sampling import even_edges
-from sparsestyle_ns.run_folder import load_run
+from sparsestyle_ns.run_folder import REPORT_FILE, load_run
 from sparsestyle_ns.style.targets import StyleTargets, covered_rows
 
 EVEN_SAMPLES = 64
@@ -77,6 +77,28 @@ class HeldOutReport:
         write_whole(path, json.dumps(content, indent=2) + "\n")
 
 
+@dataclass
+class SavedReport:
+    """What a report on the disk says.
+
+    Attributes:
+        means: see `HeldOutReport`.
+        num_views: held-out views that they are means of.
+    """
+
+    means: Dict[str, float]
+    num_views: int
+
+
+def saved_report(folder: Path, step: int) -> Optional[SavedReport]:
+    """The report in a run's folder, where there is one of the checkpoint of iteration `step`."""
+    try:
+        content = json.loads((folder / REPORT_FILE).read_text())
+        return SavedReport(content["results"], len(content["views"])) if content["step"] == step else None
+    except (OSError, ValueError, KeyError, TypeError):  # there is none, or another file has its name
+        return None
+
+
 @torch.no_grad()
 def evaluate_held_out(
     pipeline: CheckedPipeline,
@@ -100,7 +122,7 @@ def evaluate_held_out(
     model, views, rays, seconds = pipeline.model, [], [], []
     dataset = pipeline.datamanager.eval_dataset
     style_gram = None if targets is None else gram_matrix(targets.style_rows())
-    for index in track(range(len(dataset)), description="Held-out views"):
+    for index in track(range(len(dataset)), "Held-out views"):
         camera = dataset.cameras[index : index + 1].to(model.device)
         photo = dataset[index]["image"][..., :3]
         start = time.perf_counter()

@@ -6,12 +6,12 @@ from typing import Dict, List
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
-from rich.progress import track
 from torch import Tensor
 
 from sparsestyle_ns.evaluation.consistency import RANGES, PathGeometry
 from sparsestyle_ns.evaluation.warping import MIN_COVERAGE, Pinhole, Surface
 from sparsestyle_ns.models.hier_style import HierStyleModel
+from sparsestyle_ns.progress import track
 
 
 @dataclass
@@ -48,7 +48,7 @@ def render_path(model: HierStyleModel, cameras: Cameras) -> PathFrames:
     in the world, where cameras project.
     """
     frames = PathFrames([], [], [])
-    for index in track(range(len(cameras)), description="Measuring path"):
+    for index in track(range(len(cameras)), "Measuring path"):
         camera = cameras[index : index + 1].to(model.device)
         with model.rendering("exact"):
             outputs = model.get_outputs_for_camera(camera)

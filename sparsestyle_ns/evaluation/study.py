@@ -17,12 +17,13 @@ from PIL import Image
 from sparsestyle_ns.coarse_run import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.evaluation.camera_path import measuring_path
 from sparsestyle_ns.evaluation.experiments import Experiment, SceneSettings
-from sparsestyle_ns.evaluation.held_out import evaluate_run, stylisation_figures
+from sparsestyle_ns.evaluation.held_out import evaluate_run, saved_report, stylisation_figures
 from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.evaluation.path_frames import PathFrames, render_path
 from sparsestyle_ns.evaluation.style_strength import gram_matrix
 from sparsestyle_ns.method_configs import method_config
-from sparsestyle_ns.run_folder import load_run
+from sparsestyle_ns.progress import track
+from sparsestyle_ns.run_folder import REPORT_FILE, load_run
 from sparsestyle_ns.style.targets import StyleTargets
 
 HIGH_FREQUENCIES = (
@@ -156,7 +157,7 @@ class Painter:
             self._targets = replace(settings, style_image=self.painting).load_targets(torch.device("cpu"))
             self._gram = gram_matrix(self._targets.style_rows())
         values = []
-        for index in range(0, len(frames.stylised), STYLE_EVERY):
+        for index in track(range(0, len(frames.stylised), STYLE_EVERY), "Style and content"):
             stylised, coarse = frames.stylised[index], frames.coarse[index]
             figures = stylisation_figures(
                 self._targets, self._gram, coarse, stylised, frames.surfaces[index].covered.float()
@@ -202,12 +203,8 @@ def measure_frames_of_2d(
 
 def measure_coarse(folder: Path) -> Dict[str, float]:
     """A coarse run's figures on its held-out views, kept beside it."""
-    step, path = _newest_step(folder), folder / "evaluation.json"
-    if path.is_file():
-        content = json.loads(path.read_text())
-        if content["step"] == step:
-            return content["results"]
-    return evaluate_run(folder / "config.yml", path).means
+    known = saved_report(folder, _newest_step(folder))
+    return known.means if known is not None else evaluate_run(folder / "config.yml", folder / REPORT_FILE).means
 
 
 def _newest_step(folder: Path) -> int:

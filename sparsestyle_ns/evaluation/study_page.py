@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from sparsestyle_ns.evaluation.tables import Table
-from sparsestyle_ns.gallery import document, figure, write_document
+from sparsestyle_ns.page import figure, picture_page, write_page
 
 
 @dataclass
@@ -39,14 +39,14 @@ def write_study(sections: Sequence[Section], output_path: Path, title: str) -> P
     Raises:
         InputError: it can't be written there.
     """
-    return write_document(document(title, "", "".join(map(_section, sections))), output_path)
+    return write_page(picture_page(title, "", "".join(map(_section, sections))), output_path)
 
 
 def _section(section: Section) -> str:
     parts = [f"<h2>{escape(section.heading)}</h2>"]
     if section.text:
         parts.append(f"<p>{escape(section.text)}</p>")
-    parts += map(_table, section.tables)
+    parts += [each.html() for each in section.tables]
     for svg, caption in section.plots:
         source = base64.b64encode(svg.encode()).decode()
         parts.append(
@@ -64,18 +64,6 @@ def _row(name: str, pictures: Sequence[Tuple[str, Path]]) -> str:
         with Image.open(path) as image:
             figures.append(figure(np.array(image.convert("RGB")), caption, f"{caption}, {name}"))
     return f'<div class="view"><h4>{escape(name)}</h4><div class="cells">{"".join(figures)}</div></div>'
-
-
-def _table(table: Table) -> str:
-    heads = "".join(f"<th>{escape(column)}</th>" for column in ("", *table.columns))
-    rows = "".join(
-        f"<tr{' class=cited' if name in table.cited else ''}><td>{escape(name)}</td>"
-        + "".join(f"<td>{escape(cell or '–')}</td>" for cell in cells)
-        + "</tr>"
-        for name, cells in table.rows
-    )
-    note = f"<p>{escape(table.note)}</p>" if table.note else ""
-    return f'<h3>{escape(table.title)}</h3><div class="scroll"><table><tr>{heads}</tr>{rows}</table></div>{note}'
 
 
 Series = Dict[str, Tuple[Sequence[float], Sequence[float]]]

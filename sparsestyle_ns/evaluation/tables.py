@@ -1,10 +1,13 @@
 """Figures set out in tables, on a terminal and for a page."""
 
 from dataclasses import dataclass, field
+from html import escape
 from typing import Dict, List, Optional, Sequence, Tuple
 
 from rich.console import Console
 from rich.table import Table as RichTable
+
+from sparsestyle_ns.page import table
 
 LABELS: Dict[str, Tuple[str, int]] = {
     "psnr": ("PSNR dB ↑", 2),
@@ -44,13 +47,19 @@ class Table:
 
     def print(self) -> None:
         """Prints it."""
-        table = RichTable(title=self.title, title_justify="left", caption=self.note or None, caption_justify="left")
-        table.add_column("")
+        printed = RichTable(title=self.title, title_justify="left", caption=self.note or None, caption_justify="left")
+        printed.add_column("")
         for column in self.columns:
-            table.add_column(column, justify="right")
+            printed.add_column(column, justify="right")
         for name, cells in self.rows:
-            table.add_row(name, *(cell or "–" for cell in cells), style="italic dim" if name in self.cited else None)
-        Console().print(table)
+            printed.add_row(name, *(cell or "–" for cell in cells), style="italic dim" if name in self.cited else None)
+        Console().print(printed)
+
+    def html(self) -> str:
+        """It for a page."""
+        rows = [(name, *(cell or "–" for cell in cells)) for name, cells in self.rows]
+        note = f"<p>{escape(self.note)}</p>" if self.note else ""
+        return f"<div><h3>{escape(self.title)}</h3>{table(('', *self.columns), rows, self.cited)}{note}</div>\n"
 
 
 def written(key: str, value: Optional[float]) -> Optional[str]:

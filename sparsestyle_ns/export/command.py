@@ -9,7 +9,6 @@ from typing import Dict, List, Optional, Tuple
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
-from rich.progress import track
 from torch import Tensor
 
 from sparsestyle_ns.evaluation.held_out import exact_outputs
@@ -30,6 +29,7 @@ from sparsestyle_ns.export.points import (
 from sparsestyle_ns.export.voxels import Voxels, bake_voxels, render_voxels
 from sparsestyle_ns.models.hier_style import RAYS_PER_CALL, HierStyleModel
 from sparsestyle_ns.output_file import write_output
+from sparsestyle_ns.progress import track
 from sparsestyle_ns.run_folder import load_run
 
 COMPARED_SIDE = 252
@@ -74,7 +74,7 @@ def exact_pictures(scene: StylisedScene, longest: Optional[int]) -> List[Dict[st
         longest: pixels along a side, at most; None for all that the cameras have.
     """
     pictures = []
-    for index in track(range(len(scene.cameras)), description="Exact renders"):
+    for index in track(range(len(scene.cameras)), "Exact renders"):
         camera = scene.cameras[index : index + 1]
         camera = (camera if longest is None else resized(camera, longest)).to(scene.model.device)
         pictures.append({key: value.cpu() for key, value in exact_outputs(scene.model, camera).items()})

@@ -11,11 +11,11 @@ from typing import Sequence
 import torch
 from jaxtyping import Bool, Float, UInt8
 from nerfstudio.cameras.cameras import Cameras
-from rich.progress import track
 from torch import Tensor
 from torch.nn import functional as F
 
 from sparsestyle_ns.models.hier_style import RAYS_PER_CALL, HierStyleModel
+from sparsestyle_ns.progress import track
 from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT, SIDE, Rays, render_baked
 from sparsestyle_ns.rendering.density_grid import Occupancy, march
 from sparsestyle_ns.rendering.space import ForwardFacingSpace, Segments
@@ -62,7 +62,7 @@ def bake_voxels(model: HierStyleModel, resolution: int, cameras: Sequence[Camera
         cameras: one camera each, with a ray for each pixel; a brick should be some pixels wide.
     """
     volume, config = model.bake(resolution), model.config
-    for camera in track(cameras, description="Finding what can be seen"):
+    for camera in track(cameras, "Finding what can be seen"):
         bundle = camera.to(model.device).generate_rays(camera_indices=0, keep_shape=False).flatten()
         for origins, directions in zip(
             bundle.origins.split(RAYS_PER_CALL), bundle.directions.split(RAYS_PER_CALL), strict=True
@@ -75,7 +75,7 @@ def bake_voxels(model: HierStyleModel, resolution: int, cameras: Sequence[Camera
         seen = seen.repeat_interleave(SIDE, dim=axis).narrow(axis, 0, resolution)
     occupied = F.adaptive_max_pool3d(model.occupancy.occupied.float()[None], resolution)[0] > 0
     cells = (seen > 0) & (occupied | last_step_cells(model, resolution))
-    for part in track(cells.nonzero().split(CELLS_PER_CALL), description="Baking"):
+    for part in track(cells.nonzero().split(CELLS_PER_CALL), "Baking"):
         volume.fill(part)
     known = F.max_pool3d(F.pad(cells.float()[None], (1,) * 6), kernel_size=2, stride=1)[0] > 0
     codes = torch.zeros(*known.shape, 4, dtype=torch.uint8, device=known.device)

@@ -19,6 +19,7 @@ from sparsestyle_ns.field_components.point_encodings import FrequencyEncoding, N
 from sparsestyle_ns.fields.fine_tuned import FineTunedField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
+from sparsestyle_ns.progress import bar
 from sparsestyle_ns.rendering.baked import BakedVolume, Rays, render_baked
 from sparsestyle_ns.rendering.density_grid import Occupancy, march
 from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
@@ -171,10 +172,15 @@ class HierStyleModel(Model):
             self.residual.field.load_state_dict(self.field.state_dict())
         if self.occupancy is None:
             return
-        with autocast(self.device, self.config.precision):
-            self.occupancy.measure(
-                lambda points: self.field.density_and_feature(points)[0], self.config.min_alpha, POINTS_PER_CALL
-            )
+        cells = self.config.occupancy_resolution**3
+        with autocast(self.device, self.config.precision), bar("Finding empty space", cells, unit="cells") as finding:
+
+            def density(points: Tensor) -> Tensor:
+                values = self.field.density_and_feature(points)[0]
+                finding.advance(len(points))
+                return values
+
+            self.occupancy.measure(density, self.config.min_alpha, POINTS_PER_CALL)
 
     def freeze(self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]) -> FrozenSamples:
         """The samples of rays that can show, with the coarse field evaluated there."""

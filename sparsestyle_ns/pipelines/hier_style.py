@@ -14,7 +14,6 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.progress import track
 from torch import Tensor
 
 from sparsestyle_ns.errors import InputError
@@ -23,6 +22,7 @@ from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
 from sparsestyle_ns.processes import average_gradients, num_processes, own_share, put_together
+from sparsestyle_ns.progress import track
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.volume import accumulation_of, seen_behind
 from sparsestyle_ns.schedules import content_weight
@@ -152,7 +152,7 @@ class HierStylePipeline(CheckedPipeline):
         keep_bytes = self._cache_bytes()
         pixels = self.datamanager.pixels
         frozen, pictures, weights = [], [], []
-        for index, (height, width) in enumerate(pixels.sizes):
+        for index, (height, width) in enumerate(track(pixels.sizes, "Caching views")):
             rows = slice(pixels.starts[index], pixels.starts[index + 1])
             view = self._freeze(pixels.origins[rows], pixels.directions[rows], keep_bytes)
             keep_bytes -= view.kept_bytes
@@ -160,7 +160,7 @@ class HierStylePipeline(CheckedPipeline):
             accumulation = put_together(view.render(accumulation_of), height * width)
             pictures.append(self._photo(index, pixels.colors[rows], accumulation).view(height, width, 3))
             weights.append(accumulation.view(height, width))
-        for camera in self._novel_cameras():
+        for camera in track(self._novel_cameras(), "Caching novel views"):
             bundle = camera.generate_rays(camera_indices=0, keep_shape=True).to(self.device)
             rays = bundle.flatten()
             view = self._freeze(rays.origins, rays.directions, keep_bytes)
@@ -269,7 +269,7 @@ class HierStylePipeline(CheckedPipeline):
         coarse_geometry = self.model.config.stylised_field == "residual"
         parameters = list(self.model.residual.parameters())
         optimizer = torch.optim.Adam(parameters, lr=learning_rate, fused=True)
-        for step in track(range(self.config.warm_start_steps), description="Warm start", transient=True):
+        for step in track(range(self.config.warm_start_steps), "Warm start"):
             view = photos[step % len(photos)]
             loss = reconstruction_loss(self._render(view, coarse_geometry), view.picture)
             optimizer.zero_grad()

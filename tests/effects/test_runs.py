@@ -15,7 +15,7 @@ from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.exposure import ExposureCorrection
 from sparsestyle_ns.effects.panel import EffectsPanel
 from sparsestyle_ns.effects.registry import EFFECTS
-from sparsestyle_ns.gallery import RunPictures, page_html
+from sparsestyle_ns.gallery.page import RunPictures, gallery_page
 from sparsestyle_ns.run_folder import find_config, load_run
 
 AUTO = [flag for flag in TINY if flag not in ("--pipeline.effects.empty-space", "on")]
@@ -120,7 +120,7 @@ def test_a_background_is_not_exposed():
 
 def test_the_page_has_a_line_for_every_effect() -> None:
     rows = decided("box", "palette").rows()
-    page = page_html([RunPictures(name="toy", subtitle="", photos=[], views=[view()], effects=rows)], "Toys")
+    page = gallery_page([RunPictures(name="toy", subtitle="", photos=[], views=[view()], effects=rows)], "Toys")
     for name in EFFECTS:
         assert f"<tr><td>{name}</td><td>{'on' if name in ('box', 'palette') else 'off'}</td>" in page
 
@@ -128,7 +128,7 @@ def test_the_page_has_a_line_for_every_effect() -> None:
 def view():
     import numpy as np
 
-    from sparsestyle_ns.gallery import View
+    from sparsestyle_ns.gallery.page import View
 
     picture = np.zeros((4, 4, 3), np.uint8)
     return View("view", picture, picture)

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from sparsestyle_ns import progress
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.experiments import (
     SECONDS_FILE,
     Experiment,
     Laboratory,
     SceneSettings,
-    duration,
-    progress,
+    share_done,
 )
 
 PRETEND = """
@@ -163,11 +163,12 @@ def test_runs_beside_each_other_share_the_cores(laboratory: Laboratory, monkeypa
     assert threads == [2, 2]
 
 
-def test_progress_is_the_last_share_in_the_log() -> None:
-    assert progress("Starting\n10 (5.00%)   1 s\n20 (10.00%)  1 s\n") == pytest.approx(0.1)
-    assert progress("Starting") is None
-
-
-@pytest.mark.parametrize("seconds, words", [(59.6, "1:00 min"), (125, "2:05 min"), (7320, "2 h 2 min")])
-def test_durations_are_said_in_minutes_or_hours(seconds: float, words: str) -> None:
-    assert duration(seconds) == words
+def test_how_far_a_run_is_is_the_last_share_of_iterations_in_its_log(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", (0.0, 0.0))
+    with progress.bar("Caching views", 4) as one:
+        one.advance(3)
+    assert share_done(capsys.readouterr().out) is None
+    with progress.bar("Stage 1", 200, unit="iterations") as one:
+        one.advance(10)
+        one.advance(20, note="psnr 21.3")
+    assert share_done(capsys.readouterr().out + "Warm start: 3 of 4 (75%)\n") == pytest.approx(0.15)

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import pytest
 from conftest import run_entrypoint
 
-from sparsestyle_ns.evaluation.held_out import evaluate_run
+from sparsestyle_ns.cli import main
+from sparsestyle_ns.evaluation.held_out import evaluate_run, saved_report
 from sparsestyle_ns.evaluation.tables import report_tables
 from sparsestyle_ns.run_folder import find_config
 
@@ -72,3 +73,14 @@ def test_the_tables_show_each_figure_and_say_what_is_missing(capsys: pytest.Capt
     consistency.print()
     assert "short RMSE ↓" in capsys.readouterr().out
     assert len(report_tables({"psnr": 20.0}, 1)) == 1
+
+
+def test_the_command_leaves_the_report_in_the_runs_folder_and_says_what_follows(runs, tmp_path, capsys):
+    moved = tmp_path / "outputs" / "scene" / "hier-style" / "run"
+    shutil.copytree(runs.style, moved)
+    main(["evaluate", str(moved)])
+    report = saved_report(moved, step=2)
+    assert report.num_views == 2
+    assert "content_ssim" in report.means
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line == f"Made {moved / 'evaluation.json'} – next: sparsestyle gallery {moved}"

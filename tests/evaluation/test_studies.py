@@ -139,7 +139,12 @@ def test_compare_trains_what_is_missing_measures_each_row_and_writes_the_page(
     assert page.count("class=cited") == len(PAPER_ROWS)
     assert len(re.findall("<img", page)) == 3 * (1 + 5)
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
-    assert "5 runs, 0 of them finished." in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "5 runs, 0 of them finished." in printed
+    start = (
+        f"Made {tmp_path / 'compare.html'} – next: sparsestyle ablate --data {llff_scene} --style-images {painting} "
+    )
+    assert printed.splitlines()[-1].startswith(start)
 
     train_here.clear()
     (tmp_path / "compare.html").unlink()

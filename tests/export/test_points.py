@@ -147,7 +147,8 @@ def test_a_run_is_exported_with_its_errors(patterned_run, tmp_path, capsys, kind
     target = tmp_path / "new" / "scene.ply"
     main(["export", str(patterned_run), "--format", kind, "--output-path", str(target)])
     printed = capsys.readouterr().out
-    assert printed.splitlines()[-1] == f"The scene is {target}"
+    html = f"sparsestyle export {patterned_run} --format html --output-path {target.with_suffix('.html')}"
+    assert printed.splitlines()[-1] == f"Made {target} – next: {html}"
     found = re.findall(r"(image0\d\d).png: (\d+)% of its surfaces covered, PSNR there ([\d.]+) dB", printed)
     assert [name for name, _, _ in found] == ["image001", "image005", "image011"]
     assert all(int(covered) > 20 and float(value) > 15 for _, covered, value in found)

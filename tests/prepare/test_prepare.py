@@ -85,7 +85,9 @@ def test_photos_with_poses_bounds_become_an_llff_scene(tmp_path, capsys, place):
     np.testing.assert_array_equal(np.asarray(Image.open(outputs.image_filenames[1])), np.asarray(photo(ASIDE[1])))
     printed = capsys.readouterr().out
     assert "Warning" not in printed
-    assert printed.splitlines()[-1] == f"Next: ns-train coarse-fewshot --data {tmp_path / 'scene'} llff-data"
+    made, command = printed.splitlines()[-1].split(" – next: ")
+    assert made == f"Made {tmp_path / 'scene'}, 3 photos with poses"
+    assert command == f"ns-train coarse-fewshot --data {tmp_path / 'scene'} llff-data"
 
 
 def test_photos_with_transforms_become_a_nerfstudio_scene(tmp_path):

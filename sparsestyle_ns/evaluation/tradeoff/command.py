@@ -26,6 +26,7 @@ from sparsestyle_ns.evaluation.tradeoff.report import GROUPS, Report, cant_write
 from sparsestyle_ns.evaluation.tradeoff.stage1 import Stage1
 from sparsestyle_ns.evaluation.tradeoff.stage2 import Stage2
 from sparsestyle_ns.evaluation.tradeoff.study import Options, Study, quiet
+from sparsestyle_ns.next_command import after_tradeoff, finish
 
 REPORT_SECONDS = 4.0
 REPORT_SHARE = 0.05
@@ -184,4 +185,4 @@ def run(options: Options, seconds: float) -> None:
     left_out = report.everything_left_out()
     if left_out:
         say(f"Left out, {len(left_out)}:", *(f"  {line}" for line in left_out))
-    say(f"The report is {page}")
+    finish(page.resolve(), after_tradeoff(options))

@@ -5,6 +5,7 @@ import io
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -222,6 +223,16 @@ def test_what_can_not_be_used_is_said_in_one_sentence(tmp_path, arguments, sente
         main(["tradeoff", *(argument.format(tmp=tmp_path) for argument in arguments)])
     assert ended.value.code.startswith(sentence.format(tmp=tmp_path))
     assert "\n" not in ended.value.code
+
+
+def test_the_last_line_names_the_report_and_trains_on_the_scene(tmp_path, monkeypatch, capsys):
+    report = SimpleNamespace(
+        write=lambda folder: folder / "index.html", recommendation=["Take 4."], everything_left_out=lambda: []
+    )
+    monkeypatch.setattr(command, "measure", lambda *_: report)
+    command.run(make_options(Path("fern"), tmp_path), 10.0)
+    train = "ns-train coarse-fewshot-draft --data fern llff-data"
+    assert capsys.readouterr().out.splitlines() == ["Take 4.", f"Made {tmp_path / 'index.html'} – next: {train}"]
 
 
 def test_the_dataparser_is_known_from_the_files_or_named_with_its_options(llff_scene):

@@ -2,9 +2,7 @@
 
 import base64
 import io
-import json
 import re
-import shutil
 from html.parser import HTMLParser
 
 import numpy as np
@@ -12,17 +10,9 @@ import pytest
 from PIL import Image
 
 from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.gallery import (
-    Picture,
-    RunPictures,
-    View,
-    collect_run,
-    data_uri,
-    depth_picture,
-    page_html,
-    read_video,
-    write_page,
-)
+from sparsestyle_ns.evaluation.tables import Table
+from sparsestyle_ns.gallery.page import THUMBNAIL_SIDE, Film, Picture, RunPictures, View, gallery_page
+from sparsestyle_ns.page import data_uri, write_page
 
 MP4 = b"\x00\x00\x00\x18ftypmp42 the rest of a film"
 
@@ -41,6 +31,7 @@ def make_run(**changes):
             View("held-out view 0", make_pixels(10), make_pixels(11), make_pixels(12), make_pixels(13)),
             View("held-out view 8", make_pixels(14), make_pixels(15)),
         ],
+        "style_name": "night",
         "style": Picture(make_pixels(20), "night.jpg"),
         "figures": [("Coarse PSNR", "21.30 dB")],
         "settings": [("Method", "hier-style")],
@@ -75,7 +66,7 @@ class Page(HTMLParser):
 
 
 def test_page_loads_nothing_from_elsewhere():
-    html = page_html([make_run(video=MP4)], "Stylised scenes")
+    html = gallery_page([make_run(film=Film(MP4, "A turn"))], "Stylised scenes")
     assert "http:" not in html
     assert "https:" not in html
     assert "@import" not in html
@@ -86,8 +77,8 @@ def test_page_loads_nothing_from_elsewhere():
 
 
 def test_page_holds_every_picture_and_the_film():
-    run = make_run(video=MP4)
-    sources = set(Page(page_html([run], "Stylised scenes")).values("src"))
+    run = make_run(film=Film(MP4, "A turn"))
+    sources = set(Page(gallery_page([run], "Stylised scenes")).values("src"))
     pictures = [photo.pixels for photo in run.photos] + [run.style.pixels]
     for view in run.views:
         pictures += [view.stylised, view.coarse, *(p for p in (view.photo, view.depth) if p is not None)]
@@ -96,7 +87,7 @@ def test_page_holds_every_picture_and_the_film():
 
 
 def test_every_picture_is_described_and_keeps_its_place_while_loading():
-    page = Page(page_html([make_run()], "Stylised scenes"))
+    page = Page(gallery_page([make_run()], "Stylised scenes"))
     images = page.values("alt")
     assert all(images)
     assert len(images) == page.values("width").count("8") == page.values("height").count("6")
@@ -115,7 +106,7 @@ def test_large_picture_is_a_jpeg():
 
 def test_slider_shows_coarse_and_stylised_render_of_first_view():
     run = make_run()
-    html = page_html([run], "Stylised scenes")
+    html = gallery_page([run], "Stylised scenes")
     slider = html[html.index('<div class="compare">') :]
     first, second = re.findall(r'src="([^"]+)"', slider)[:2]
     assert first == data_uri(run.views[0].stylised)
@@ -129,38 +120,82 @@ def test_names_are_text_never_markup():
         subtitle=attack,
         photos=[Picture(make_pixels(0), attack)],
         views=[View(attack, make_pixels(1), make_pixels(2))],
+        style_name=attack,
         style=None,
         style_note=attack,
+        film=Film(MP4, attack),
         figures=[(attack, attack)],
         settings=[(attack, attack)],
     )
-    html = page_html([run, run], attack)
+    html = gallery_page([run, run], attack)
     assert html.count("<script>") == 1
     assert attack in Page(html).texts
 
 
 def test_missing_style_image_is_noted():
-    html = page_html([make_run(style=None, style_note="The style image, night.jpg, is no longer there.")], "Scenes")
+    html = gallery_page([make_run(style=None, style_note="The style image, night.jpg, is no longer there.")], "Scenes")
     assert "The style image, night.jpg, is no longer there." in html
 
 
 def test_page_without_film_or_figures_has_no_empty_places_for_them():
-    html = page_html([make_run(figures=[])], "Scenes")
+    html = gallery_page([make_run(figures=[])], "Scenes")
     assert "<video" not in html
     assert "Measured" not in html
 
 
 def test_several_runs_get_a_contents_that_leads_to_them():
-    page = Page(page_html([make_run(name="fern"), make_run(name="flower")], "Scenes"))
+    page = Page(gallery_page([make_run(name="fern"), make_run(name="flower")], "Scenes"))
     links = [link[1:] for link in page.values("href") if link.startswith("#")]
-    assert links == ["run-1", "run-2"]
-    assert set(links) <= set(page.values("id"))
+    assert set(links) == {"run-1", "run-2"} <= set(page.values("id"))
+
+
+def grid_of(runs):
+    """The grid's cells, as rows of the runs that each leads to; its headings; and its HTML."""
+    html = gallery_page(runs, "Scenes")
+    if '<section class="grid"' not in html:
+        return None, None, html
+    grid = html[html.index('<section class="grid"') : html.index("</section>")]
+    rows = re.findall(r"<tr>(.*?)</tr>", grid)[1:]
+    cells = [[re.findall(r'href="#run-(\d)"', cell) for cell in re.findall(r"<td>(.*?)</td>", row)] for row in rows]
+    return cells, re.findall(r"<span>(.*?)</span>", grid), grid
+
+
+def test_the_grid_has_scenes_down_and_paintings_across_with_gaps_where_there_is_no_run():
+    night, hat = make_run(), make_run(style_name="hat", style=Picture(make_pixels(21), "hat.jpg"))
+    flower = make_run(name="flower", style_name="hat")
+    again = make_run(name="flower", style_name="hat")
+    cells, headings, grid = grid_of([night, hat, flower, again])
+    assert cells == [[["1"], ["2"]], [[], ["3", "4"]]]
+    assert headings == ["night", "hat", "fern", "flower"]
+    sources = re.findall(r'src="([^"]+)"', grid)
+    assert data_uri(make_pixels(20)) in sources  # paintings
+    assert data_uri(make_pixels(11)) in sources  # the scene as it was
+    assert data_uri(make_pixels(10)) in sources  # and stylised
+
+
+def test_one_run_has_no_grid():
+    assert grid_of([make_run()])[0] is None
+
+
+def test_the_grids_pictures_are_small():
+    large = View("view", make_pixels(1, 400, 500), make_pixels(2, 400, 500))
+    grid = grid_of([make_run(views=[large]), make_run(style_name="hat", views=[large])])[2]
+    assert max(map(int, re.findall(r'width="(\d+)"', grid))) == 500 // 3 <= THUMBNAIL_SIDE
+
+
+def test_figures_of_all_held_out_views_take_the_place_of_those_of_the_views_that_are_shown():
+    measured = Table("Style and content, 25 held-out views", ["NNFM <&>"], [("stylised", ["0.1"]), ("none", [None])])
+    html = gallery_page([make_run(tables=[measured])], "Scenes")
+    assert "21.30 dB" not in html
+    texts = Page(html).texts
+    for text in ("Style and content, 25 held-out views", "NNFM <&>", "stylised", "0.1", "–"):
+        assert text in texts
 
 
 def test_write_page_makes_the_folder_and_leaves_only_the_page(tmp_path):
     target = tmp_path / "new" / "folder" / "index.html"
-    assert write_page([make_run()], target, "Scenes") == target
-    assert target.read_text(encoding="utf-8") == page_html([make_run()], "Scenes")
+    assert write_page("<p>Zoë</p>", target) == target
+    assert target.read_text(encoding="utf-8") == "<p>Zoë</p>"
     assert [path.name for path in target.parent.iterdir()] == ["index.html"]
 
 
@@ -173,76 +208,17 @@ def test_failed_write_leaves_the_former_page(tmp_path, monkeypatch):
 
     monkeypatch.setattr("os.replace", fail)
     with pytest.raises(InputError, match="No space left"):
-        write_page([make_run()], target, "Scenes")
+        write_page("page", target)
     assert target.read_text() == "former"
     assert list(tmp_path.iterdir()) == [target]
 
 
 def test_page_can_not_take_a_folders_place(tmp_path):
     with pytest.raises(InputError, match=r"is a folder; name a file, such as .*index.html"):
-        write_page([make_run()], tmp_path, "Scenes")
+        write_page("page", tmp_path)
 
 
 def test_folder_that_can_not_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError, match=r"can't be written to .*index.html"):
-        write_page([make_run()], tmp_path / "file" / "index.html", "Scenes")
-
-
-def test_read_video_takes_mp4_only(tmp_path):
-    film, text = tmp_path / "film.mp4", tmp_path / "film.txt"
-    film.write_bytes(MP4)
-    text.write_text("no film")
-    assert read_video(film) == MP4
-    with pytest.raises(InputError, match="is no MP4 video"):
-        read_video(text)
-    with pytest.raises(InputError, match="can't be read"):
-        read_video(tmp_path / "gone.mp4")
-
-
-def test_depth_picture_is_lighter_where_things_are_nearer():
-    depth = np.geomspace(1.0, 100.0, 64).reshape(8, 8, 1)
-    brightness = depth_picture(depth, np.ones_like(depth)).mean(-1).ravel()
-    assert np.all(np.diff(brightness) <= 0)
-    assert brightness[0] - brightness[-1] > 100
-
-
-def test_depth_picture_of_nothing_is_grey():
-    empty = depth_picture(np.full((4, 4, 1), 1e9), np.zeros((4, 4, 1)))
-    np.testing.assert_array_equal(empty, np.full((4, 4, 3), 128))
-
-
-def test_collect_run_shows_photos_and_held_out_views_wherever_the_run_is_now(runs, tmp_path, monkeypatch):
-    moved = tmp_path / "elsewhere" / "hier-style" / "renamed"
-    shutil.copytree(runs.style, moved)
-    monkeypatch.chdir(tmp_path)
-    run = collect_run(moved, num_views=2)
-    assert [photo.caption for photo in run.photos] == json.loads((runs.style / "scene.json").read_text())["view_names"]
-    assert len(run.photos) == 3
-    assert [view.name for view in run.views] == ["Held-out view image000.png", "Held-out view image008.png"]
-    assert run.style.caption == "painting.png"
-    for view in run.views:
-        for pixels in (view.photo, view.coarse, view.stylised, view.depth):
-            assert pixels.shape == (24, 32, 3)
-            assert pixels.dtype == np.uint8
-    assert dict(run.settings)["Iterations"] == "3 of 3"
-    assert dict(run.figures)["Mean of"] == "2 views"
-    assert run.subtitle == "hier-style, 3 photos, 3 iterations"
-    assert Page(page_html([run], "A run")).values("src")
-
-
-def test_collect_run_shows_a_run_whose_painting_is_gone(runs, tmp_path):
-    moved = tmp_path / "outputs" / "scene" / "hier-style" / "run"
-    shutil.copytree(runs.style, moved)
-    config = moved / "config.yml"
-    config.write_text(config.read_text().replace("- painting.png", "- gone.png"))
-    run = collect_run(config, num_views=1)
-    assert run.style is None
-    assert "gone.png, is no longer there" in run.style_note
-
-
-def test_collect_run_says_that_a_run_has_no_checkpoint(runs, tmp_path):
-    moved = tmp_path / "outputs" / "scene" / "hier-style" / "run"
-    shutil.copytree(runs.style, moved, ignore=shutil.ignore_patterns("*.ckpt"))
-    with pytest.raises(InputError, match="has no checkpoint yet"):
-        collect_run(moved)
+        write_page("page", tmp_path / "file" / "index.html")
