@@ -70,7 +70,7 @@ class CoarseFewShotModelConfig(ModelConfig):
     thinning: float = 2.0
     """Samples whose gradient is smaller than this many times the batch's mean take part in the backward pass with a
     probability in proportion only, and count for more where they do; 0: all samples take part."""
-    even_share: float = 0.1
+    even_share: float = 0.4
     """Share of those samples, in (0, 1], that is spread evenly."""
     grid_resolution: int = 64
     """Cells along a side of the grid that remembers density."""
