@@ -1,5 +1,6 @@
 """Controls that nerfstudio's viewer elements lack."""
 
+from pathlib import Path
 from typing import Any, Callable, Optional
 
 from nerfstudio.viewer.viewer_elements import ViewerElement
@@ -19,7 +20,8 @@ class Markdown(ViewerElement[str]):
         self._content = content
 
     def _create_gui_handle(self, viser_server: ViserServer) -> None:
-        self.gui_handle = viser_server.gui.add_markdown(self._content, visible=self.visible)
+        # viser warns where it is told no folder of pictures; pictures here are data, not files.
+        self.gui_handle = viser_server.gui.add_markdown(self._content, visible=self.visible, image_root=Path())
 
     def install(self, viser_server: ViserServer) -> None:
         """Makes it."""

@@ -213,7 +213,7 @@ def test_restyling_gives_a_style_that_blends_and_a_run_that_renders(
     with pipeline.model.rendering("baked"):
         assert torch.equal(pipeline.model.get_outputs_for_camera(camera)["rgb"], second)
     render(saved, tmp_path / "pictures")
-    assert len(list((tmp_path / "pictures").rglob("*.png"))) == 1
+    assert len(list((tmp_path / "pictures").rglob("*.jpg"))) == 1
 
 
 def test_a_style_that_cant_be_saved_is_there_and_says_so(panel: StylePanel, monkeypatch: pytest.MonkeyPatch) -> None:
