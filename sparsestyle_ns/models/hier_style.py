@@ -22,7 +22,7 @@ from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
 from sparsestyle_ns.rendering.baked import BakedVolume, Rays, render_baked
 from sparsestyle_ns.rendering.density_grid import Occupancy, march
 from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
-from sparsestyle_ns.rendering.mixing import Mix
+from sparsestyle_ns.rendering.mixing import STYLISED, Mix
 from sparsestyle_ns.rendering.precision import Precision, autocast
 from sparsestyle_ns.rendering.space import ForwardFacingSpace, Segments
 from sparsestyle_ns.rendering.volume import (
@@ -308,6 +308,12 @@ class HierStyleModel(Model):
         rays = Rays(segments, self.occupancy, config.num_steps, self.space.unbounded, config.min_transmittance)
         first, second = (*map(self._current_volume, styles), None)[:2]
         return render_baked(first, rays, self.background, mix, second)
+
+    def fill_baked(
+        self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], style: nn.Module
+    ) -> None:
+        """Works out what baked pictures of a style need along these rays, for later."""
+        self._render_baked(self.space.segments(origins, directions), (style,), STYLISED)
 
     def _render_exact(self, ray_bundle: RayBundle, styles: Tuple[nn.Module, ...], mix: Mix) -> Tuple[PackedRender, ...]:
         frozen = self.freeze(ray_bundle.origins, ray_bundle.directions)

@@ -5,7 +5,7 @@ import threading
 import time
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, Callable, List, Optional
+from typing import Any, Callable, List, Optional, Tuple
 
 import numpy as np
 import torch
@@ -21,10 +21,12 @@ from nerfstudio.viewer.viewer_elements import (
     ViewerSlider,
     ViewerText,
 )
+from torch import nn
 
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.models.hier_style import RENDER_MODES, Look
 from sparsestyle_ns.rendering.mixing import Mix
+from sparsestyle_ns.viewer.baking import Baker
 from sparsestyle_ns.viewer.elements import Markdown, ProgressBar, UploadButton
 from sparsestyle_ns.viewer.restyling import Progress, Restyling, Workshop
 from sparsestyle_ns.viewer.styles import (
@@ -45,6 +47,8 @@ SECONDS_BETWEEN_TEXTS = 0.5
 """Losses and progress are not told more often than this."""
 SECONDS_AT_REST = 0.3
 """A restyling goes on when nothing was moved for so long: a picture on the way needs the processor."""
+SECONDS_UNTIL_BAKING = 2.0
+"""Volumes are filled ahead when nothing was moved for so long, so that the still picture comes first."""
 MAX_SIDE_ON_CPU = 256
 """Longer side of still pictures where there is no GPU; nerfstudio's own is 512."""
 
@@ -107,6 +111,10 @@ class StylePanel(ViewerControl):
         self._install()
         self._guard_outputs()
         self.pipeline.model.viewer_look = self.look
+        if self.pipeline.device.type == "cpu":
+            cameras = self.pipeline.datamanager.train_dataset.cameras
+            self.baker = Baker(self.pipeline.model, cameras, self._shown, self._is_free, self._lock())
+            self.baker.start()
         viewer.viser_server.on_client_connect(self._welcome)
 
     def _take_defaults(self) -> None:
@@ -196,9 +204,13 @@ class StylePanel(ViewerControl):
         """What the controls say, to the viewer's own threads; None to all others."""
         if not isinstance(threading.current_thread(), RenderStateMachine):
             return None
-        style, other = self._named(self.style.value), self._named(self.other.value)
-        styles = (style.field,) if other is None or other is style else (style.field, other.field)
-        return Look(self.mode.value, Mix(self.strength.value, self.geometry.value, self.blend.value), styles)
+        mix = Mix(self.strength.value, self.geometry.value, self.blend.value)
+        return Look(self.mode.value, mix, self._shown())
+
+    def _shown(self) -> Tuple[nn.Module, ...]:
+        """The fields of the style and of the one that it is blended with."""
+        style, other = self._named(self.style.value) or self.styles[0], self._named(self.other.value)
+        return (style.field,) if other is None or other is style else (style.field, other.field)
 
     def _named(self, name: str) -> Optional[Style]:
         return next((style for style in self.styles if style.name == name), None)
@@ -305,11 +317,19 @@ class StylePanel(ViewerControl):
 
     def _let_pictures_pass(self) -> None:
         """Waits while a camera or a control is being moved."""
-        while True:
-            camera = time.time() - self.viewer.last_move_time
-            if min(camera, time.monotonic() - self._last_change) > SECONDS_AT_REST or self._stop.is_set():
-                return
+        while self._at_rest() < SECONDS_AT_REST and not self._stop.is_set():
             time.sleep(0.02)
+
+    def _at_rest(self) -> float:
+        """Seconds since a camera or a control was moved."""
+        return min(time.time() - self.viewer.last_move_time, time.monotonic() - self._last_change)
+
+    def _is_free(self) -> bool:
+        """Whether volumes may be filled ahead."""
+        trainer = self.viewer.trainer
+        trains = trainer is not None and trainer.training_state != "completed"
+        idle = not self._busy.locked() and self._at_rest() > SECONDS_UNTIL_BAKING
+        return self.mode.value == "baked" and idle and not trains
 
     def _keep(self, restyling: Restyling) -> str:
         """Adds the new style, shows it, and saves it; what came of that."""

@@ -21,6 +21,7 @@ from PIL import Image
 
 from sparsestyle_ns.evaluation.training import Training
 from sparsestyle_ns.run_folder import find_config, load_run
+from sparsestyle_ns.viewer.baking import STEPS_BETWEEN
 from sparsestyle_ns.viewer.panel import NO_BLEND, StylePanel
 from sparsestyle_ns.viewer.restyling import Restyling, Workshop, run_config
 from sparsestyle_ns.viewer.styles import StyleImage, free_name
@@ -107,6 +108,23 @@ def test_without_a_gpu_the_viewer_begins_with_baked_pictures(panel: StylePanel) 
     assert panel.mode.value == "baked" and panel.mode.options == ["exact", "baked"]
     drawn(panel)
     assert panel.pipeline.model.residual in panel.pipeline.model._baked
+
+
+def test_volumes_are_filled_ahead_for_the_photos_cameras_and_those_between(
+    panel: StylePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sparsestyle_ns.viewer.panel.SECONDS_UNTIL_BAKING", 0.0)
+    end = time.monotonic() + 60
+    while not panel.baker.is_done():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert len(panel.baker.cameras) == 3 + 2 * STEPS_BETWEEN
+    monkeypatch.setattr(panel.pipeline.model.field, "density_and_feature", None)
+    bundle = panel.baker.cameras[-1].generate_rays(camera_indices=0, keep_shape=True)
+    thread = Drawing(lambda: panel.pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"])
+    thread.start()
+    thread.join()
+    assert max(thread.result.shape) == 252 and thread.result.std() > 0.05
 
 
 def test_the_panel_says_what_made_the_style(panel: StylePanel) -> None:

@@ -83,8 +83,8 @@ def test_losses_are_shown_pausing_pauses_and_a_restyling_leaves_training_as_it_i
             assert time.monotonic() < end
             time.sleep(0.05)
         told.append(panel.message.content)
-        assert trainer.step == 1  # paused all the while
-        assert "Iteration 2" in panel.training.content
+        # Paused all the while, before the third iteration.
+        assert trainer.step == 2 and panel.training.content.startswith("Iteration 2 of 3")
 
     run = train_with_viewer(runs, llff_scene, painting, tmp_path / "a", monkeypatch, act, at_step=1, iterations=3)
     (message,) = told
