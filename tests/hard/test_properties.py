@@ -579,7 +579,7 @@ def test_transferred_colours_have_the_styles_mean(data, count, style_count, dtyp
     assert (cut >= 0).all() and (cut <= 1).all()
 
 
-@covers(image.load_style_image)
+@covers(image.load_style_image, image.read_bytes, image.decode_style_image)
 @given(
     arrays.arrays(
         st.sampled_from([np.uint8, np.uint16]),
@@ -595,6 +595,7 @@ def test_pictures_are_read_as_they_were_written(tmp_path_factory, pixels, max_si
     assume(max_side is None or min(pixels.shape) * max_side >= 8 * max(pixels.shape))
     read = image.load_style_image(path, max_side)
     assert read.dtype == torch.float32 and read.min() >= 0 and read.max() <= 1
+    assert torch.equal(image.decode_style_image(image.read_bytes(path), path.name, max_side), read)
     if max_side is None:
         expected = torch.from_numpy(pixels.astype(np.float32) / largest)
         torch.testing.assert_close(read, expected.expand(3, -1, -1))
