@@ -23,6 +23,7 @@ from nerfstudio.viewer.viewer_elements import (
 )
 from torch import nn
 
+from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.models.hier_style import RENDER_MODES, Look
 from sparsestyle_ns.rendering.mixing import Mix
@@ -33,9 +34,9 @@ from sparsestyle_ns.viewer.styles import (
     Style,
     StyleImage,
     checkpoint_notes,
-    code,
     find_thumbnail,
     free_name,
+    plain,
     run_facts,
 )
 
@@ -68,8 +69,10 @@ class StylePanel(ViewerControl):
         config, redraw = pipeline.model.config, lambda _: self._changed()
         self.description = Markdown()
         self.style = ViewerDropdown("Style", "…", ["…"], cb_hook=lambda _: self._style_chosen())
-        self.other = ViewerDropdown("Blend with", NO_BLEND, [NO_BLEND], cb_hook=redraw)
-        self.blend = ViewerSlider("Blend", 0.5, 0.0, 1.0, 0.01, cb_hook=redraw, hint="0: the style, 1: the other one")
+        self.other = ViewerDropdown("Blend with", NO_BLEND, [NO_BLEND], cb_hook=lambda _: self._other_chosen())
+        self.blend = ViewerSlider(
+            "Blend", 0.5, 0.0, 1.0, 0.01, visible=False, cb_hook=redraw, hint="0: the style, 1: the other one"
+        )
         self.strength = ViewerSlider(
             "Strength", config.strength, 0.0, 1.0, 0.01, cb_hook=redraw, hint="0: the coarse field, 1: the stylised one"
         )
@@ -110,6 +113,7 @@ class StylePanel(ViewerControl):
         self._describe_run()
         self._install()
         self._guard_outputs()
+        self._hide_frustums()
         self.pipeline.model.viewer_look = self.look
         if self.pipeline.device.type == "cpu":
             cameras = self.pipeline.datamanager.train_dataset.cameras
@@ -125,7 +129,7 @@ class StylePanel(ViewerControl):
             self._workshop = Workshop(self.pipeline, self.folder, self._lock())
             self.iterations.value = self._workshop.config.max_num_iterations
         except InputError as error:
-            self.message.content = f"**No restyling.** {error}"
+            self.message.content = f"**No restyling.** {plain(str(error))}"
 
     def _lock(self) -> Any:
         """The lock that iterations of training and the viewer's pictures take turns by."""
@@ -155,13 +159,13 @@ class StylePanel(ViewerControl):
         with gui.add_folder("Style", order=self.viewer.stats_markdown.order + 0.5):
             self._add(self.strength, self.geometry, self.style, self.other, self.blend, self.mode, self.split)
             self._add(self.training)
-            with gui.add_folder("Restyle", expand_by_default=False):
+            with gui.add_folder("Another style", expand_by_default=False):
                 self._add(self.path, self.iterations, self.start, self.upload)
             self._add(self.message, self.bar, self.stop)
-            with gui.add_folder("What made it", expand_by_default=False):
+            with gui.add_folder("What made it"):
                 self._add(self.description)
             with gui.add_folder("Effects of this scene", expand_by_default=False):
-                self._add(Markdown(self.pipeline.effects.markdown()))
+                self._add(Markdown(_effects_text(self.pipeline.effects)))
 
     def _add(self, *elements: ViewerElement) -> None:
         for element in elements:
@@ -181,7 +185,7 @@ class StylePanel(ViewerControl):
         self._apply_split()
 
     def _welcome(self, client: Any) -> None:
-        """Has a new browser look at the scene as one of its photos does, the frustums out of the way."""
+        """Has a new browser look at the scene as its most central photo does."""
         from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 
         cameras = self.pipeline.datamanager.train_dataset.cameras
@@ -194,9 +198,17 @@ class StylePanel(ViewerControl):
             client.camera.up_direction = pose[:, 1]
             client.camera.look_at = position - VISER_NERFSTUDIO_SCALE_RATIO * pose[:, 2]
             client.camera.fov = 2.0 * math.atan(float(cameras.cy[centre] / cameras.fy[centre]))
-        if self.viewer.hide_images.visible and hasattr(self.viewer, "camera_handles"):
-            self.viewer.set_camera_visibility(False)
-            self.viewer.toggle_cameravis_button()
+
+    def _hide_frustums(self) -> None:
+        """Has the photos' frustums hidden as soon as they are drawn: one at a camera's place would fill the window."""
+        viewer, draw = self.viewer, self.viewer.init_scene
+
+        def draw_and_hide(*arguments: Any, **named: Any) -> None:
+            draw(*arguments, **named)
+            viewer.set_camera_visibility(False)
+            viewer.toggle_cameravis_button()
+
+        viewer.init_scene = draw_and_hide
 
     # What is drawn
 
@@ -221,6 +233,10 @@ class StylePanel(ViewerControl):
 
     def _style_chosen(self) -> None:
         self._show_description()
+        self._changed()
+
+    def _other_chosen(self) -> None:
+        self.blend.set_visible(self.other.value != NO_BLEND)
         self._changed()
 
     def _apply_split(self) -> None:
@@ -285,7 +301,7 @@ class StylePanel(ViewerControl):
             restyling = self._new_restyling(read())
         except Exception as error:  # whatever it is, the viewer goes on
             self._busy.release()
-            self._end(f"**Not restyled.** {_sentence(error)}")
+            self._end(f"**Not restyled.** {plain(_sentence(error))}")
             return
         self._stop.clear()
         self.stop.set_visible(True)
@@ -311,7 +327,7 @@ class StylePanel(ViewerControl):
             self._end(self._keep(restyling))
         except Exception as error:  # whatever it is, the viewer goes on
             CONSOLE.print_exception()
-            self._end(f"**Not restyled.** {_sentence(error)}")
+            self._end(f"**Not restyled.** {plain(_sentence(error))}")
         finally:
             self._busy.release()
 
@@ -342,13 +358,13 @@ class StylePanel(ViewerControl):
         try:
             folder, ending = restyling.save(), ""
         except OSError as error:
-            folder, ending = self.folder, f" It is **not saved**, {code(str(error))}, and gone when the viewer ends."
+            folder, ending = self.folder, f" It is **not saved**, {plain(str(error))}, and gone when the viewer ends."
         name = free_name(Path(image.name).stem, [style.name for style in self.styles])
         facts = run_facts(folder, Path(image.name), notes)
         with self._lock():
             self.styles.append(Style(name, restyling.field, facts, image.thumbnail()))
         self._offer_styles(name)
-        return f"{code(name)} is ready." + (ending or f" Saved as a run of its own: {code(str(folder))}")
+        return f"**{plain(name)}** is ready." + (ending or f" Saved as a run of its own: {plain(str(folder))}")
 
     def _tell(self, progress: Progress) -> None:
         if progress.losses is not None and time.monotonic() - self._last_text < SECONDS_BETWEEN_TEXTS:
@@ -368,6 +384,14 @@ class StylePanel(ViewerControl):
 
 def _loss_text(what: str, weight: float, content: float, style: float) -> str:
     return f"{what}: λ {weight:.3g}, content {content:.3f}, style {style:.3f}"
+
+
+def _effects_text(effects: Decisions) -> str:
+    """Each effect in a line; a table would be wider than the panel."""
+    lines = []
+    for name, state, measured, threshold, why in (item.cells() for item in effects.items):
+        lines.append(f"**{plain(name)}** {state}: {measured} {plain(why)} (threshold {threshold})")
+    return "\n\n".join(lines)
 
 
 def _minutes(seconds: float) -> str:

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Dict, Iterable, List, Optional, Tuple
@@ -105,12 +106,12 @@ class Style:
         picture = []
         if self.thumbnail is not None:
             picture = [f"![painting](data:image/jpeg;base64,{base64.b64encode(self.thumbnail).decode()})"]
-        return "\n\n".join([*picture, *(f"**{name}** {code(value)}" for name, value in self.facts)])
+        return "\n\n".join([*picture, *(f"**{name}** {plain(value)}" for name, value in self.facts)])
 
 
-def code(text: str) -> str:
-    """Text that Markdown shows as it is."""
-    return "`" + " ".join(text.replace("`", "'").split()) + "`"
+def plain(text: str) -> str:
+    """Text that Markdown shows as it is, and breaks where it doesn't fit into the panel, as code would not."""
+    return re.sub(r"([\\`*_{}\[\]<>()#+!|~$&])", r"\\\1", " ".join(text.split()))
 
 
 def free_name(name: str, taken: Iterable[str]) -> str:

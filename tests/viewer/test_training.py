@@ -88,7 +88,7 @@ def test_losses_are_shown_pausing_pauses_and_a_restyling_leaves_training_as_it_i
 
     run = train_with_viewer(runs, llff_scene, painting, tmp_path / "a", monkeypatch, act, at_step=1, iterations=3)
     (message,) = told
-    assert "`painting 2` is ready" in message
+    assert "**painting 2** is ready" in message
     states = [newest_checkpoint(folder / "nerfstudio_models") for folder in (run, runs.style)]
     found, expected = (torch.load(path, weights_only=True)["pipeline"] for path in states)
     assert found.keys() == expected.keys()
