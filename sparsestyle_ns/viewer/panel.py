@@ -123,11 +123,12 @@ class StylePanel(ViewerControl):
 
     def _take_defaults(self) -> None:
         if self.pipeline.device.type == "cpu":
-            self.mode.value = "baked"
             self.viewer.control_panel._max_res.value = MAX_SIDE_ON_CPU
+            if self.viewer.trainer is None:  # while a field learns, nothing that is baked lasts
+                self.mode.value = "baked"
         try:
             self._workshop = Workshop(self.pipeline, self.folder, self._lock())
-            self.iterations.value = self._workshop.config.max_num_iterations
+            self.iterations.value = self._workshop.config().max_num_iterations
         except InputError as error:
             self.message.content = f"**No restyling.** {plain(str(error))}"
 
@@ -310,7 +311,7 @@ class StylePanel(ViewerControl):
     def _new_restyling(self, image: StyleImage) -> Restyling:
         if self._workshop is None:
             raise InputError("This run can't be restyled in this viewer.")
-        if self.viewer.trainer is not None and self.pipeline.scene_views is None:
+        if self.viewer.trainer is not None and not self._described:
             raise InputError("The scene is still being prepared for training; try again when it has begun.")
         return Restyling(self._workshop, image, int(self.iterations.value))
 

@@ -5,7 +5,6 @@ whose colours stay, and the feature network. New are a field, the painting's fea
 model and what is trained or shown meanwhile are only read, so that no lock is held while the field learns.
 """
 
-import copy
 import functools
 import shutil
 import time
@@ -61,19 +60,30 @@ class Workshop:
 
     Args:
         pipeline: the `HierStylePipeline` of the scene.
-        folder: of its run, whose config.yml has the optimiser, the schedule and the number of iterations.
+        folder: of its run.
         lock: held while something changes that other threads may use: the random numbers' state.
 
     Raises:
-        InputError: there is no config.yml, it can't be read, or several processes train together.
+        InputError: several processes train together.
     """
 
     def __init__(self, pipeline: Any, folder: Path, lock: ContextManager) -> None:
         if num_processes() > 1:
             raise InputError("Several processes train this scene together; restyle it in ns-viewer, once it is saved.")
         self.pipeline, self.folder, self.lock = pipeline, folder, lock
-        self.config = run_config(folder)
         self._backbone: Optional[VGGFeatures] = None
+
+    def config(self) -> TrainerConfig:
+        """The run's config, with the optimiser, the schedule and the number of iterations.
+
+        Raises:
+            InputError: it isn't there or can't be read.
+        """
+        path = self.folder / "config.yml"
+        try:
+            return yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
+        except Exception as error:  # yaml builds arbitrary objects, so anything can go wrong in it
+            raise InputError(f"{path} can't be read ({error}); restyling takes the run's settings from it.") from error
 
     def backbone(self) -> VGGFeatures:
         """The feature network that the pipeline has, else one with the weights that it would take."""
@@ -109,7 +119,7 @@ class Restyling:
 
     def __init__(self, workshop: Workshop, image: StyleImage, iterations: Optional[int] = None) -> None:
         self.workshop, self.pipeline, self.image = workshop, workshop.pipeline, image
-        self.config = copy.deepcopy(workshop.config)
+        self.config = workshop.config()
         self.iterations = self.config.max_num_iterations if iterations is None else iterations
         if self.iterations < 1:
             raise InputError(f"A style needs at least 1 iteration, and {self.iterations} were asked for.")
@@ -212,16 +222,3 @@ def _free_folder(parent: Path) -> Path:
             return folder
         except FileExistsError:
             time.sleep(0.1)
-
-
-def run_config(folder: Path) -> TrainerConfig:
-    """The config of the run in a folder.
-
-    Raises:
-        InputError: there is none, or it can't be read.
-    """
-    path = folder / "config.yml"
-    try:
-        return yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
-    except Exception as error:  # yaml builds arbitrary objects, so anything can go wrong in it
-        raise InputError(f"{path} can't be read ({error}); restyling takes the run's settings from it.") from error

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -84,7 +85,9 @@ class Page:
     def scene(self) -> np.ndarray:
         """The pixels left of the panel, once they are there and have come to rest."""
         before, since, end = self._pixels(), time.monotonic(), time.monotonic() + PATIENCE
-        while time.monotonic() - since < 2.0 or before.std() < 10 or "Resolution: 256x" not in self.text():
+        # While something moves, pictures are smaller than 256 pixels on a CPU, or 512 on a GPU.
+        still = re.compile(r"Resolution: (256|512)x")
+        while time.monotonic() - since < 2.0 or before.std() < 10 or not still.search(self.text()):
             assert time.monotonic() < end, "no picture, or none that comes to rest"
             time.sleep(0.3)
             now = self._pixels()

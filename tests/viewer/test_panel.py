@@ -13,6 +13,7 @@ from typing import Callable, Iterator, List
 import numpy as np
 import pytest
 import torch
+import yaml
 from conftest import run_entrypoint
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
@@ -23,7 +24,7 @@ from sparsestyle_ns.evaluation.training import Training
 from sparsestyle_ns.run_folder import find_config, load_run
 from sparsestyle_ns.viewer.baking import STEPS_BETWEEN
 from sparsestyle_ns.viewer.panel import NO_BLEND, StylePanel
-from sparsestyle_ns.viewer.restyling import Restyling, Workshop, run_config
+from sparsestyle_ns.viewer.restyling import Restyling, Workshop
 from sparsestyle_ns.viewer.styles import StyleImage, free_name, plain
 
 
@@ -277,12 +278,11 @@ def write_camera_path(folder: Path) -> Path:
 
 
 def test_restyling_takes_the_trainers_steps(runs: SimpleNamespace, painting: Path) -> None:
-    config = run_config(runs.style)
+    config = yaml.load((runs.style / "config.yml").read_text(), Loader=yaml.Loader)
     coarse = torch.load(next((runs.coarse / "nerfstudio_models").iterdir()), weights_only=True)["pipeline"]
     state = {name.removeprefix("_model."): value for name, value in coarse.items()}
-    training = Training(run_config(runs.style), torch.device("cpu"), state)
+    training = Training(config, torch.device("cpu"), state)
     pipeline = training.pipeline
-    pipeline.model.residual.load_state_dict(pipeline.model.residual.state_dict())
     fresh = pipeline.model.new_style()
     pipeline.model.residual.load_state_dict(fresh.state_dict())
     for _ in pipeline.warm_up(pipeline.task(), config.optimizers["fields"]["optimizer"].lr):

@@ -13,6 +13,7 @@ import torch
 from conftest import TINY_STYLE, ns_train
 
 from sparsestyle_ns.coarse_run import newest_checkpoint
+from sparsestyle_ns.run_folder import load_run
 from sparsestyle_ns.trainer import HierStyleTrainer
 
 
@@ -89,6 +90,9 @@ def test_losses_are_shown_pausing_pauses_and_a_restyling_leaves_training_as_it_i
     run = train_with_viewer(runs, llff_scene, painting, tmp_path / "a", monkeypatch, act, at_step=1, iterations=3)
     (message,) = told
     assert "**painting 2** is ready" in message
+    (saved,) = (folder for folder in run.parent.iterdir() if folder != run)
+    _, pipeline, _ = load_run(saved / "config.yml")
+    assert pipeline.config.coarse_run == runs.coarse.resolve()
     states = [newest_checkpoint(folder / "nerfstudio_models") for folder in (run, runs.style)]
     found, expected = (torch.load(path, weights_only=True)["pipeline"] for path in states)
     assert found.keys() == expected.keys()
