@@ -85,15 +85,18 @@ class Page:
     def scene(self) -> np.ndarray:
         """The pixels left of the panel, once they are there and have come to rest."""
         before, since, end = self._pixels(), time.monotonic(), time.monotonic() + PATIENCE
-        # While something moves, pictures are smaller than 256 pixels on a CPU, or 512 on a GPU.
-        still = re.compile(r"Resolution: (256|512)x")
-        while time.monotonic() - since < 2.0 or before.std() < 10 or not still.search(self.text()):
+        while time.monotonic() - since < 2.0 or before.std() < 10 or not self._is_still():
             assert time.monotonic() < end, "no picture, or none that comes to rest"
             time.sleep(0.3)
             now = self._pixels()
             if np.abs(now - before).mean() > 0.5:
                 before, since = now, time.monotonic()
         return before
+
+    def _is_still(self) -> bool:
+        """Whether the picture is a still one: while something moves, its longer side is smaller."""
+        size = re.search(r"Resolution: (\d+)x(\d+)px", self.text())
+        return size is not None and max(map(int, size.groups())) in (256, 512)  # on a CPU, on a GPU
 
     def _pixels(self) -> np.ndarray:
         return self.tab.screenshot()[80:620, 20:520].astype(float)
