@@ -27,7 +27,6 @@ from sparsestyle_ns.finite_steps import FiniteOptimizers
 from sparsestyle_ns.processes import num_processes
 from sparsestyle_ns.scene_record import FILE_NAME as SCENE_RECORD
 from sparsestyle_ns.style.vgg import VGGFeatures, load_backbone
-from sparsestyle_ns.trainer import without_numpy_scalars
 from sparsestyle_ns.viewer.styles import StyleImage, save_thumbnail
 
 SEED = 42
@@ -176,6 +175,8 @@ class Restyling:
         Raises:
             OSError: it can't be written.
         """
+        from sparsestyle_ns.trainer import without_numpy_scalars  # which needs the pipelines, and they this package
+
         folder = self.workshop.folder
         new = _free_folder(folder.parent)
         suffix = Path(self.image.name).suffix
