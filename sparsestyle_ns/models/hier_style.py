@@ -283,10 +283,14 @@ class HierStyleModel(Model):
     def _current_volume(self, style: nn.Module) -> BakedVolume:
         """A style's baked volume, a new one whenever what it shows has changed since the last picture."""
         state = self._state_of_weights(style)
-        volume, known = self._baked.pop(style, (None, []))
+        volume, known = self._baked.get(style, (None, []))
         if volume is None or not all(map(torch.equal, known, state)):
             volume = self.bake(self.config.bake_resolution, style)
-        self._baked[style] = volume, state
+        # The viewer may break a picture off between any two lines; here that loses nothing.
+        self._baked = {
+            **{each: kept for each, kept in self._baked.items() if each is not style},
+            style: (volume, state),
+        }
         for oldest in list(self._baked)[:-MOST_BAKED]:
             del self._baked[oldest]
         return volume

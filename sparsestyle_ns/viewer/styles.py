@@ -110,8 +110,12 @@ class Style:
 
 
 def plain(text: str) -> str:
-    """Text that Markdown shows as it is, and breaks where it doesn't fit into the panel, as code would not."""
-    return re.sub(r"([\\`*_{}\[\]<>()#+!|~$&])", r"\\\1", " ".join(text.split()))
+    """Text that Markdown shows as it is, and that may be broken behind slashes and underscores.
+
+    viser's Markdown takes JSX; a panel with a path in it that doesn't fit would have to be scrolled sideways.
+    """
+    escaped = re.sub(r"([\\`*_{}\[\]<>()#+!|~$&])", r"\\\1", " ".join(text.split()))
+    return re.sub(r"(/|\\_)", r"\1<wbr />", escaped)
 
 
 def free_name(name: str, taken: Iterable[str]) -> str:
