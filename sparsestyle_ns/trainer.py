@@ -39,6 +39,7 @@ from sparsestyle_ns.processes import any_process, from_first_process, prepare_la
 from sparsestyle_ns.progress import bar, say
 from sparsestyle_ns.scene_record import record_scene
 from sparsestyle_ns.style.image import load_style_image
+from sparsestyle_ns.viewer.styles import StyleImage, save_thumbnail
 
 STEPS_PER_LOOK = 10
 """Iterations between looks at the count of skipped steps, each of which waits for a GPU."""
@@ -219,9 +220,10 @@ class SparseStyleTrainer(Trainer):
             CONSOLE.print("The viewer is closed.")
 
     def _on_interrupt(self, number: int, frame: Any) -> None:
-        if self._interrupted or self.training_state != "training":
+        if self._interrupted or self.training_state == "completed":
             raise KeyboardInterrupt
         self._interrupted = True
+        self.training_state = "training"  # one that the viewer paused goes on for an iteration
         CONSOLE.print("Ctrl-C: finishing this iteration, then saving. Press it again to stop at once.")
 
     def train_iteration(self, step: int) -> Any:
@@ -418,10 +420,15 @@ class HierStyleTrainer(SparseStyleTrainer):
         super().setup(test_mode)
         self.config.pipeline.backbone = self.pipeline.targets.backbone.description.name
         self._write_config(self.config)
+        self._keep_thumbnail()
 
     @check_main_thread
     def _write_config(self, config: TrainerConfig) -> None:
         config.save_config()
+
+    @check_main_thread
+    def _keep_thumbnail(self) -> None:
+        save_thumbnail(self.base_dir, StyleImage.read(self.config.pipeline.style_image))
 
     def notes(self) -> Dict[str, Any]:
         """Which feature network stylised the scene, where its weights came from, and which coarse run it builds on."""

@@ -1,18 +1,18 @@
 """`hier-style`: the coarse field, frozen, and the residual field that stylises it (stage 2)."""
 
 import contextlib
-from dataclasses import dataclass, field
-from typing import Any, Dict, Iterator, List, Literal, Optional, Tuple, Type
+from dataclasses import dataclass, field, replace
+from typing import Any, Callable, Dict, Iterator, List, Literal, Optional, Tuple, Type
 
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.models.base_model import Model, ModelConfig
-from nerfstudio.viewer.viewer_elements import ViewerDropdown
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import Parameter
 
 from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.field_components.point_encodings import FrequencyEncoding, NoEncoding, PointEncoding
@@ -23,6 +23,7 @@ from sparsestyle_ns.progress import bar
 from sparsestyle_ns.rendering.baked import BakedVolume, Rays, render_baked
 from sparsestyle_ns.rendering.density_grid import Occupancy, march
 from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
+from sparsestyle_ns.rendering.mixing import STYLISED, Mix
 from sparsestyle_ns.rendering.precision import Precision, autocast
 from sparsestyle_ns.rendering.space import ForwardFacingSpace, Segments
 from sparsestyle_ns.rendering.volume import (
@@ -30,7 +31,7 @@ from sparsestyle_ns.rendering.volume import (
     FrozenSamples,
     PackedRender,
     freeze_samples,
-    render_frozen_coarse,
+    render_mixed,
     render_stylised,
     straight_color,
 )
@@ -38,6 +39,9 @@ from sparsestyle_ns.rendering.volume import (
 RAYS_PER_CALL = 1 << 13
 """Rays that are marched at once; bounds the memory of the steps in empty space."""
 RenderMode = Literal["exact", "baked"]
+RENDER_MODES: Tuple[RenderMode, ...] = ("exact", "baked")
+MOST_BAKED = 4
+"""Styles whose baked volumes are kept, the latest that were shown."""
 AHEAD = ((0.0, 0.0, -1.0),)
 """Where cameras of a forward-facing scene look."""
 ALL_AROUND = ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
@@ -91,11 +95,31 @@ class HierStyleModelConfig(ModelConfig):
     """How pictures are made outside of training. baked keeps the fields in a voxel grid, filled where rays come by: a
     scene's first picture takes as long as an exact one, those from near by a small part of that, also on a CPU. The
     viewer has a control for it; for ns-render, write `render_mode: baked` into the run's config.yml."""
+    strength: float = 1.0
+    """From 0, the coarse field, to 1, the stylised one, in pictures made outside of training. The viewer has controls
+    for this and the next; for ns-render, write them into the run's config.yml, as render_mode."""
+    geometry_strength: float = 1.0
+    """Share of the residual density, 0 to 1, that these pictures show."""
     bake_resolution: int = 256
     """Cells along the cube's side in baked rendering. Each brick of 8³ that rays have been to takes 4 KiB: at most
     147 MB with 256, 482 MB with 384."""
     eval_num_rays_per_chunk: int = 8192
     """Rays rendered at once outside of training."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """How pictures are made, and of what.
+
+    Attributes:
+        mode: exact or baked.
+        mix: how much of each field they show.
+        styles: the stylised fields, one or two, on the model's device; None: the model's own.
+    """
+
+    mode: RenderMode
+    mix: Mix
+    styles: Optional[Tuple[nn.Module, ...]] = None
 
 
 class HierStyleModel(Model):
@@ -118,10 +142,26 @@ class HierStyleModel(Model):
         if self.exposure is not None:
             self.exposure.requires_grad_(False)
         self.register_buffer("background", effects.build("background"), persistent=False)
-        self.render_mode = ViewerDropdown(
-            "Render mode", config.render_mode, ["exact", "baked"], hint="baked: quick, from a voxel grid"
-        )
-        self._baked: Optional[Tuple[BakedVolume, List[Tensor]]] = None
+        self.look = Look(config.render_mode, self._configured_mix())
+        self.viewer_look: Callable[[], Optional[Look]] = lambda: None
+        self._baked: Dict[nn.Module, Tuple[BakedVolume, List[Tensor]]] = {}
+
+    def _configured_mix(self) -> Mix:
+        config = self.config
+        for name in ("strength", "geometry_strength"):
+            if not 0.0 <= getattr(config, name) <= 1.0:
+                flag = name.replace("_", "-")
+                raise InputError(f"--pipeline.model.{flag} is {getattr(config, name)}; give a number from 0 to 1.")
+        return Mix(config.strength, config.geometry_strength)
+
+    def new_style(self) -> nn.Module:
+        """A field to be stylised, as it is before training, on the model's device."""
+        effects: Decisions = self.kwargs["metadata"]["effects"]
+        if self.config.stylised_field == "residual":
+            return self._residual_field(effects).to(self.device)
+        style = self._fine_tuned_field(effects).to(self.device)
+        style.field.load_state_dict(self.field.state_dict())
+        return style
 
     def _residual_field(self, effects: Decisions) -> ResidualField:
         config = self.config
@@ -212,17 +252,18 @@ class HierStyleModel(Model):
         samples = march(segments, self.occupancy, self.config.num_steps, self.space.unbounded)
         return torch.bincount(samples.ray_indices, minlength=len(origins))
 
-    def stylised(self, frozen: FrozenSamples, coarse_geometry: bool = False) -> PackedRender:
-        """Renders σ_f, or with `coarse_geometry` σ_c, and c_f at frozen samples; differentiable."""
-        with autocast(self.device, self.config.precision):
-            return render_stylised(self.residual, frozen, self.background, coarse_geometry)
+    def stylised(
+        self, frozen: FrozenSamples, coarse_geometry: bool = False, style: Optional[nn.Module] = None
+    ) -> PackedRender:
+        """Renders σ_f, or with `coarse_geometry` σ_c, and c_f at frozen samples; differentiable.
 
-    def coarse(self, frozen: FrozenSamples, directions: Float[Tensor, "rays 3"]) -> PackedRender:
-        """Renders σ_c and c_c at frozen samples."""
+        Args:
+            style: the stylised field; None: the model's own.
+        """
         with autocast(self.device, self.config.precision):
-            return render_frozen_coarse(self.field, frozen, directions, self.background)
+            return render_stylised(style or self.residual, frozen, self.background, coarse_geometry)
 
-    def bake(self, resolution: int) -> BakedVolume:
+    def bake(self, resolution: int, style: Optional[nn.Module] = None) -> BakedVolume:
         """The fields as they are now, to be kept in a voxel grid; nothing is evaluated before rays are rendered.
 
         c_c, where it depends on the view direction, is that of a camera that looks straight ahead in a forward-facing
@@ -232,49 +273,72 @@ class HierStyleModel(Model):
         if self.field.direction_encoding is None or isinstance(self.space, ForwardFacingSpace):
             seen_from = AHEAD
         directions = torch.tensor(seen_from, device=self.device)
+        residual = style or self.residual
 
         def shade(points: Tensor) -> Tensor:
             with autocast(self.device, self.config.precision):
                 density, feature = self.field.density_and_feature(points)
                 feature = feature.float()
-                fine_density, fine_color = self.residual(self.residual.locate(points), feature, density)
+                fine_density, fine_color = residual(residual.locate(points), feature, density)
                 colors = [self.field.color(feature, direction.expand_as(points)) for direction in directions]
                 color = torch.stack(colors).mean(dim=0)
             return torch.cat([density[:, None], fine_density[:, None], fine_color, color], dim=-1)
 
         return BakedVolume(shade, resolution, self.device)
 
-    def _current_volume(self) -> BakedVolume:
-        """The baked volume, a new one whenever the model's state has changed since the last picture."""
-        state = self._state_of_weights()
-        if self._baked is None or not all(map(torch.equal, self._baked[1], state)):
-            self._baked = self.bake(self.config.bake_resolution), state
-        return self._baked[0]
+    def _current_volume(self, style: nn.Module) -> BakedVolume:
+        """A style's baked volume, a new one whenever what it shows has changed since the last picture."""
+        state = self._state_of_weights(style)
+        volume, known = self._baked.get(style, (None, []))
+        if volume is None or not all(map(torch.equal, known, state)):
+            volume = self.bake(self.config.bake_resolution, style)
+        # The viewer may break a picture off between any two lines; here that loses nothing.
+        self._baked = {
+            **{each: kept for each, kept in self._baked.items() if each is not style},
+            style: (volume, state),
+        }
+        for oldest in list(self._baked)[:-MOST_BAKED]:
+            del self._baked[oldest]
+        return volume
 
-    def _state_of_weights(self) -> List[Tensor]:
-        """What changes with every change of the weights and is quick to compare.
+    def _state_of_weights(self, style: nn.Module) -> List[Tensor]:
+        """What changes with every change of the weights that a style's pictures show, and is quick to compare.
 
         torch counts the changes of each tensor, but not those that fused optimisers make; these change every parameter
         of the residual MLP.
         """
-        tensors = [*self.parameters(), *self.buffers()]
+        frozen = [part for part in (self.field, self.space, self.occupancy) if isinstance(part, nn.Module)]
+        tensors = [tensor for part in (*frozen, style) for tensor in (*part.parameters(), *part.buffers())]
         versions = torch.tensor([(tensor.data_ptr(), tensor._version) for tensor in tensors])
-        values = [parameter for name, parameter in self.residual.named_parameters() if not name.startswith("grid")]
+        values = [parameter for name, parameter in style.named_parameters() if not name.startswith("grid")]
         return [versions, torch.cat([value.detach().flatten() for value in values])]
 
-    def _render_baked(self, segments: Segments) -> Tuple[PackedRender, PackedRender]:
+    def _render_baked(self, segments: Segments, styles: Tuple[nn.Module, ...], mix: Mix) -> Tuple[PackedRender, ...]:
         config = self.config
         rays = Rays(segments, self.occupancy, config.num_steps, self.space.unbounded, config.min_transmittance)
-        return render_baked(self._current_volume(), rays, self.background)
+        first, second = (*map(self._current_volume, styles), None)[:2]
+        return render_baked(first, rays, self.background, mix, second)
+
+    def fill_baked(
+        self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], style: nn.Module
+    ) -> None:
+        """Works out what baked pictures of a style need along these rays, for later."""
+        self._render_baked(self.space.segments(origins, directions), (style,), STYLISED)
+
+    def _render_exact(self, ray_bundle: RayBundle, styles: Tuple[nn.Module, ...], mix: Mix) -> Tuple[PackedRender, ...]:
+        frozen = self.freeze(ray_bundle.origins, ray_bundle.directions)
+        with autocast(self.device, self.config.precision):
+            return render_mixed(self.field, styles, frozen, ray_bundle.directions, self.background, mix)
 
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
         """`rgb` (stylised), `accumulation`, `depth` in world units, and the same of the coarse field as `…_coarse`."""
         segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
-        if self.render_mode.value == "baked" and not self.training:
-            fine, coarse = self._render_baked(segments)
+        look = self.viewer_look() or self.look
+        styles = look.styles or (self.residual,)
+        if look.mode == "baked" and not self.training:
+            fine, coarse = self._render_baked(segments, styles, look.mix)
         else:
-            frozen = self.freeze(ray_bundle.origins, ray_bundle.directions)
-            fine, coarse = self.stylised(frozen), self.coarse(frozen, ray_bundle.directions)
+            fine, coarse = self._render_exact(ray_bundle, styles, look.mix)
         return {
             "rgb": fine.rgb,
             "rgb_coarse": coarse.rgb,
@@ -286,12 +350,12 @@ class HierStyleModel(Model):
 
     @contextlib.contextmanager
     def rendering(self, mode: RenderMode) -> Iterator[None]:
-        """Within it, pictures are made in this mode, whatever the model's own is."""
-        before, self.render_mode.value = self.render_mode.value, mode
+        """Within it, pictures are made in this mode, whatever the model's own is; those for the viewer as it says."""
+        before, self.look = self.look, replace(self.look, mode=mode)
         try:
             yield
         finally:
-            self.render_mode.value = before
+            self.look = before
 
     def get_rgba_image(self, outputs: Dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colour without background, and opacity, for `ns-export tsdf` and ns-render's output rgba.

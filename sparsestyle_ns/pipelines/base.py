@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Dict, Literal, Optional
+from typing import Any, Dict, Literal, Optional, Union
 
 import tyro
 from nerfstudio.data.datamanagers.base_datamanager import DataManagerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from torch.amp import GradScaler
 
 from sparsestyle_ns.datamanager import FewShotDataManager, FewShotDataManagerConfig
@@ -58,9 +59,13 @@ class CheckedPipeline(VanillaPipeline):
         config.decided = self.datamanager.effects
         config.datamanager.decided = None
         CONSOLE.print("Effects:", self.effects.text(), sep="\n", soft_wrap=True, highlight=False)
-        self.effects_panel = EffectsPanel(lambda: self.effects.markdown())
+        self.panel = self.make_panel()
         if test_mode != "val":
             put_ffmpeg_on_path()
+
+    def make_panel(self) -> Union[ViewerElement, ViewerControl]:
+        """What the viewer shows of this run beside nerfstudio's own controls."""
+        return EffectsPanel(lambda: self.effects.markdown())
 
     @property
     def effects(self) -> Decisions:

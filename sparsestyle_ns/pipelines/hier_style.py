@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Dict, List, Literal, Optional, Tuple, Type
+from typing import Annotated, Any, Dict, Iterator, List, Literal, Optional, Tuple, Type
 
 import psutil
 import torch
@@ -14,22 +14,24 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
+from torch import Tensor, nn
 
+from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.finite_steps import broken, step_if_finite
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
 from sparsestyle_ns.processes import average_gradients, num_processes, own_share, put_together
-from sparsestyle_ns.progress import track
+from sparsestyle_ns.progress import bar, track
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.volume import accumulation_of, seen_behind
 from sparsestyle_ns.schedules import content_weight
 from sparsestyle_ns.style.color import apply_palette, color_moments
 from sparsestyle_ns.style.image import load_style_image
 from sparsestyle_ns.style.targets import StyleTargets
-from sparsestyle_ns.style.vgg import load_backbone
+from sparsestyle_ns.style.vgg import VGGFeatures, load_backbone
+from sparsestyle_ns.viewer.panel import StylePanel
 
 
 @dataclass
@@ -92,9 +94,29 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         if self.style_features is not None and self.style_features < 1:
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
         image = load_style_image(self.style_image)
-        backbone = load_backbone(self.backbone, self.vgg_weights).to(device)
+        return self.targets_of(image.to(device), load_backbone(self.backbone, self.vgg_weights).to(device))
+
+    def targets_of(self, image: Float[Tensor, "3 H W"], backbone: VGGFeatures) -> StyleTargets:
+        """A painting as a feature network on its device sees it, with these settings."""
         style_side = self.style_side or self.feature_side
-        return StyleTargets(backbone, image.to(device), self.feature_side, style_side, self.style_features)
+        return StyleTargets(backbone, image, self.feature_side, style_side, self.style_features)
+
+
+@dataclass
+class SceneView:
+    """A view that is stylised, as far as it depends on no style.
+
+    Attributes:
+        frozen: its rays, ready to render.
+        picture: its photo at the mean exposure, or its coarse render.
+        accumulation: how opaque the coarse field is in each pixel.
+        features: the feature network's view of the picture, once a style has asked for it.
+    """
+
+    frozen: FrozenView
+    picture: Float[Tensor, "H W 3"]
+    accumulation: Float[Tensor, "H W"]
+    features: Optional[Float[Tensor, "1 768 h w"]] = None
 
 
 @dataclass
@@ -114,13 +136,66 @@ class ContentView:
     accumulation: Optional[Float[Tensor, "H W"]]
 
 
+@dataclass
+class StepLosses:
+    """What an iteration minimises.
+
+    Attributes:
+        step: its number, from 0.
+        content_weight: λ.
+        content, style: L_content and L_style.
+    """
+
+    step: int
+    content_weight: float
+    content: Float[Tensor, ""]
+    style: Float[Tensor, ""]
+
+    def terms(self) -> Dict[str, Tensor]:
+        """The two summands of L_total (Eq. 5)."""
+        return {"content_loss": self.content_weight * self.content, "style_loss": self.style}
+
+    def metrics(self) -> Dict[str, Any]:
+        """Both losses, without their gradients, and λ."""
+        return {"content": self.content.detach(), "style": self.style.detach(), "lambda": self.content_weight}
+
+
+@dataclass
+class StyleTask:
+    """A field that is on its way to a painting.
+
+    Attributes:
+        style: the field.
+        targets: the painting.
+        views: what it is stylised on; in turn, one an iteration.
+    """
+
+    style: nn.Module
+    targets: StyleTargets
+    views: List[ContentView]
+
+
 class HierStylePipeline(CheckedPipeline):
     """Stage 2. What only training needs, the painting and the feature network, is loaded when training is set up."""
 
     config: HierStylePipelineConfig
     model: HierStyleModel
     targets: Optional[StyleTargets] = None
+    scene_views: Optional[List[SceneView]] = None
     views: List[ContentView]
+
+    def make_panel(self) -> StylePanel:
+        """See `CheckedPipeline.make_panel`."""
+        return StylePanel(self)
+
+    def task(self) -> StyleTask:
+        """What this run trains."""
+        assert self.targets is not None
+        return StyleTask(self.model.residual, self.targets, self.views)
+
+    def new_task(self, style: nn.Module, targets: StyleTargets, effects: Decisions) -> StyleTask:
+        """Another field and painting for the same views; what of these depends on no painting is shared."""
+        return StyleTask(style, targets, self.content_views(targets, effects))
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -149,35 +224,55 @@ class HierStylePipeline(CheckedPipeline):
     def prepare_views(self) -> None:
         """Freezes what never changes of each view, and computes its content features."""
         assert self.targets is not None
+        self.scene_views = self._freeze_views()
+        self.views = self.content_views(self.targets, self.effects)
+        self._report_cache()
+
+    @torch.no_grad()
+    def content_views(self, targets: StyleTargets, effects: Decisions) -> List[ContentView]:
+        """The views for one painting; what depends on none is worked out once and shared by all."""
+        if self.scene_views is None:
+            self.scene_views = self._freeze_views()
+        pictures = [view.picture for view in self.scene_views]
+        if effects.on("palette"):
+            pictures = self._in_style_colors(pictures, targets, effects)
+        return [
+            ContentView(
+                view.frozen,
+                picture,
+                self._features(view, picture, targets),
+                None if self.model.background is None else view.accumulation,
+            )
+            for view, picture in zip(self.scene_views, pictures, strict=True)
+        ]
+
+    def _features(self, view: SceneView, picture: Tensor, targets: StyleTargets) -> Tensor:
+        """Content features; those of a view's own picture are the same for every painting."""
+        if picture is not view.picture:
+            return targets.features(picture)
+        if view.features is None:
+            view.features = targets.features(picture)
+        return view.features
+
+    def _freeze_views(self) -> List[SceneView]:
         keep_bytes = self._cache_bytes()
         pixels = self.datamanager.pixels
-        frozen, pictures, weights = [], [], []
+        views = []
         for index, (height, width) in enumerate(track(pixels.sizes, "Caching views")):
             rows = slice(pixels.starts[index], pixels.starts[index + 1])
-            view = self._freeze(pixels.origins[rows], pixels.directions[rows], keep_bytes)
-            keep_bytes -= view.kept_bytes
-            frozen.append(view)
-            accumulation = put_together(view.render(accumulation_of), height * width)
-            pictures.append(self._photo(index, pixels.colors[rows], accumulation).view(height, width, 3))
-            weights.append(accumulation.view(height, width))
+            frozen = self._freeze(pixels.origins[rows], pixels.directions[rows], keep_bytes)
+            keep_bytes -= frozen.kept_bytes
+            accumulation = put_together(frozen.render(accumulation_of), height * width)
+            picture = self._photo(index, pixels.colors[rows], accumulation).view(height, width, 3)
+            views.append(SceneView(frozen, picture, accumulation.view(height, width)))
         for camera in track(self._novel_cameras(), "Caching novel views"):
             bundle = camera.generate_rays(camera_indices=0, keep_shape=True).to(self.device)
             rays = bundle.flatten()
-            view = self._freeze(rays.origins, rays.directions, keep_bytes)
-            keep_bytes -= view.kept_bytes
-            frozen.append(view)
+            frozen = self._freeze(rays.origins, rays.directions, keep_bytes)
+            keep_bytes -= frozen.kept_bytes
             outputs = self.model.get_outputs_for_camera_ray_bundle(bundle)
-            pictures.append(outputs["rgb_coarse"])
-            weights.append(outputs["accumulation"].squeeze(-1))
-        if self.effects.on("palette"):
-            pictures = self._in_style_colors(pictures, weights)
-        self.views = [
-            ContentView(
-                view, picture, self.targets.features(picture), None if self.model.background is None else weight
-            )
-            for view, picture, weight in zip(frozen, pictures, weights, strict=True)
-        ]
-        self._report_cache()
+            views.append(SceneView(frozen, outputs["rgb_coarse"], outputs["accumulation_coarse"].squeeze(-1)))
+        return views
 
     def _photo(self, index: int, colors: Tensor, accumulation: Tensor) -> Tensor:
         """A photo's colours, at the mean exposure where photos have their own."""
@@ -206,9 +301,9 @@ class HierStylePipeline(CheckedPipeline):
         origins, directions = own_share(origins), own_share(directions)
         return self.model.freeze_view(origins, directions, self.config.samples_per_chunk, keep_bytes)
 
-    def _render(self, view: ContentView, coarse_geometry: bool = False) -> Float[Tensor, "H W 3"]:
+    def _render(self, view: ContentView, style: nn.Module, coarse_geometry: bool = False) -> Float[Tensor, "H W 3"]:
         """The stylised picture of a view, of which each process renders its share of the rays."""
-        own = view.frozen.render(lambda chunk: self.model.stylised(chunk, coarse_geometry).rgb)
+        own = view.frozen.render(lambda chunk: self.model.stylised(chunk, coarse_geometry, style).rgb)
         return put_together(own, view.picture[..., 0].numel()).view(view.picture.shape)
 
     def _novel_cameras(self) -> List[Cameras]:
@@ -239,13 +334,13 @@ class HierStylePipeline(CheckedPipeline):
             for pose in novel[: self.config.novel_views]
         ]
 
-    def _in_style_colors(self, pictures: List[Tensor], weights: List[Tensor]) -> List[Tensor]:
+    def _in_style_colors(self, pictures: List[Tensor], targets: StyleTargets, effects: Decisions) -> List[Tensor]:
         """Pictures with the painting's colours; where the scene is transparent the background stays as it is."""
-        photos = len(self.datamanager.pixels.sizes)
+        photos, weights = len(self.datamanager.pixels.sizes), [view.accumulation for view in self.scene_views]
         colors = torch.cat([picture.reshape(-1, 3) for picture in pictures[:photos]])
         weight = torch.cat([weight.reshape(-1) for weight in weights[:photos]])
-        style = color_moments(self.targets.style_image.permute(1, 2, 0).reshape(-1, 3))
-        matrix, offset = self.effects.build("palette", content=color_moments(colors, weight), style=style)
+        style = color_moments(targets.style_image.permute(1, 2, 0).reshape(-1, 3))
+        matrix, offset = effects.build("palette", content=color_moments(colors, weight), style=style)
         transferred = [apply_palette(picture, matrix, offset, clamp=True) for picture in pictures]
         if self.model.background is None:
             return transferred
@@ -255,7 +350,13 @@ class HierStylePipeline(CheckedPipeline):
         ]
 
     def warm_start(self, learning_rate: float) -> None:
-        """Fits c_f, on the coarse geometry, to the content pictures of the photos.
+        """Warms this run's field up (see `warm_up`)."""
+        with bar("Warm start", self.config.warm_start_steps) as warming:
+            for _ in self.warm_up(self.task(), learning_rate):
+                warming.advance()
+
+    def warm_up(self, task: StyleTask, learning_rate: float) -> Iterator[int]:
+        """Fits c_f, on the coarse geometry, to the content pictures of the photos; an iterator of its steps.
 
         A coarse field that is fine-tuned itself is fitted as a whole: its colours can't change with its geometry held.
 
@@ -265,30 +366,35 @@ class HierStylePipeline(CheckedPipeline):
         Args:
             learning_rate: Adam's; that of the iterations that follow.
         """
-        photos = self.views[: len(self.datamanager.pixels.sizes)]
+        photos = task.views[: len(self.datamanager.pixels.sizes)]
         coarse_geometry = self.model.config.stylised_field == "residual"
-        parameters = list(self.model.residual.parameters())
+        parameters = list(task.style.parameters())
         optimizer = torch.optim.Adam(parameters, lr=learning_rate, fused=True)
-        for step in track(range(self.config.warm_start_steps), "Warm start"):
+        for step in range(self.config.warm_start_steps):
             view = photos[step % len(photos)]
-            loss = reconstruction_loss(self._render(view, coarse_geometry), view.picture)
+            loss = reconstruction_loss(self._render(view, task.style, coarse_geometry), view.picture)
             optimizer.zero_grad()
             loss.backward()
             average_gradients(parameters)
             if step_if_finite(optimizer, broken(parameters)):
                 optimizer.step()
+            yield step
         optimizer.zero_grad()
+
+    def step(self, task: StyleTask, step: int) -> Tuple[Tensor, StepLosses]:
+        """One whole view of a task, and λ(t), L_content and L_style (Eq. 5 and 6)."""
+        view = task.views[step % len(task.views)]
+        image = self._render(view, task.style)
+        style, content = task.targets.losses(image, view.features, view.accumulation)
+        config = self.config
+        weight = content_weight(step, config.content_weight, config.content_decay, config.content_steps)
+        return image, StepLosses(step, weight, content, style)
 
     def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Tensor], Dict[str, Tensor], Dict[str, Any]]:
         """One whole view: λ(t) L_content and L_style (Eq. 5 and 6)."""
-        assert self.targets is not None
-        view = self.views[step % len(self.views)]
-        image = self._render(view)
-        style, content = self.targets.losses(image, view.features, view.accumulation)
-        config = self.config
-        weight = content_weight(step, config.content_weight, config.content_decay, config.content_steps)
-        metrics = {"content": content.detach(), "style": style.detach(), "lambda": weight}
-        return {"rgb": image}, {"content_loss": weight * content, "style_loss": style}, metrics
+        image, losses = self.step(self.task(), step)
+        self.panel.show_losses(losses)
+        return {"rgb": image}, losses.terms(), losses.metrics()
 
     @torch.no_grad()
     def get_eval_loss_dict(self, step: int) -> Tuple[Dict[str, Tensor], Dict[str, Tensor], Dict[str, Any]]:

@@ -1,9 +1,9 @@
 """Baked rendering: the two fields kept in a voxel grid of the cube, which is filled where rays come by.
 
 σ_f, c_f and σ_c depend on the position alone, so that a value worked out for one picture serves all others. The first
-picture of a scene takes as long as an exact one, later ones what looking values up takes. Samples, empty cells and
-early stops are those of the exact render (`freeze_samples`, `render_stylised`, `render_frozen_coarse`); what differs is
-that values between voxels are interpolated.
+picture of a scene takes as long as an exact one, later ones what looking values up takes, whatever mixture of the
+fields they show (`mixing`). Samples, empty cells and early stops are those of the exact render (`freeze_samples`,
+`render_mixed`); what differs is that values between voxels are interpolated.
 
 A value takes a byte. Densities are kept as their logarithm, and interpolated so: they are exponentials of a smooth
 function, and their error then shows hardly beside that of the colours (fern, 256³ voxels: 42.2 dB against the exact
@@ -22,6 +22,7 @@ from torch import Tensor
 from sparsestyle_ns.kernels import even_parts, run_on_threads
 from sparsestyle_ns.rendering import baked_kernels
 from sparsestyle_ns.rendering.density_grid import Occupancy
+from sparsestyle_ns.rendering.mixing import STYLISED, Appearance, Mix, mixed
 from sparsestyle_ns.rendering.sampling import even_edges
 from sparsestyle_ns.rendering.space import MAX_DISTANCE, ContractedSegments, LinearSegments, Segments, spacing
 from sparsestyle_ns.rendering.volume import (
@@ -189,54 +190,84 @@ ONE_CELL = np.ones((1, 1, 1), dtype=bool)
 
 @torch.no_grad()
 def render_baked(
-    volume: BakedVolume, rays: Rays, background: Optional[Float[Tensor, "3"]]
+    volume: BakedVolume,
+    rays: Rays,
+    background: Optional[Float[Tensor, "3"]],
+    mix: Mix = STYLISED,
+    second: Optional[BakedVolume] = None,
 ) -> Tuple[PackedRender, PackedRender]:
-    """The stylised and the coarse render of rays through a baked volume."""
-    if volume.codes.device.type == "cpu":
-        return march_compiled(volume, rays, background)
-    return march_in_torch(volume, rays, background)
+    """The render of a mixture of the fields, by default the stylised one, and the coarse render.
+
+    Args:
+        mix: how much of each field counts.
+        second: of another style, with the same coarse field and resolution.
+    """
+    march = march_compiled if volume.codes.device.type == "cpu" else march_in_torch
+    return march(volume, rays, background, mix, second)
 
 
 @torch.no_grad()
 def march_in_torch(
-    volume: BakedVolume, rays: Rays, background: Optional[Float[Tensor, "3"]]
+    volume: BakedVolume,
+    rays: Rays,
+    background: Optional[Float[Tensor, "3"]],
+    mix: Mix = STYLISED,
+    second: Optional[BakedVolume] = None,
 ) -> Tuple[PackedRender, PackedRender]:
-    """`render_baked` on any device: the exact render, with the volume in the fields' place."""
+    """`render_baked` on any device: the exact render, with the volumes in the fields' place."""
     samples, density, values = visible_samples(
         volume, rays.occupancy, rays.segments, rays.num_steps, rays.unbounded, rays.min_transmittance
     )
-    stylised_density, stylised_color, color = values.split([1, 3, 3], dim=-1)
+    coarse, styles = Appearance(density, values[:, 4:]), [_style(values)]
+    if second is not None:
+        styles.append(_style(second.density_and_feature(samples.positions)[1]))
     num_rays = len(rays.segments.hit)
-    stylised = render_packed(samples, num_rays, stylised_density.squeeze(-1), stylised_color, background)
-    return stylised, render_packed(samples, num_rays, density, color, background)
+    render = render_packed(samples, num_rays, *mixed(coarse, styles, mix), background)
+    return render, render_packed(samples, num_rays, *coarse, background)
+
+
+def _style(feature: Float[Tensor, "points 7"]) -> Appearance:
+    return Appearance(feature[:, 0], feature[:, 1:4])
 
 
 @torch.no_grad()
 def march_compiled(
-    volume: BakedVolume, rays: Rays, background: Optional[Float[Tensor, "3"]]
+    volume: BakedVolume,
+    rays: Rays,
+    background: Optional[Float[Tensor, "3"]],
+    mix: Mix = STYLISED,
+    second: Optional[BakedVolume] = None,
 ) -> Tuple[PackedRender, PackedRender]:
     """`render_baked` on a CPU: rays are marched until none has come by a voxel that isn't filled."""
     lines = _lines(rays)
     left = torch.arange(len(lines.hit))
     sums = torch.zeros(len(left), 10)
+    shares = tuple(map(np.float32, (mix.density_share, mix.strength, mix.blend)))
     while len(left):
         missing = torch.full((len(left), baked_kernels.LOOKAHEAD), baked_kernels.NO_CELL)
-        voxels = baked_kernels.Voxels(
-            ONE_CELL if rays.occupancy is None else rays.occupancy.occupied.numpy(),
-            volume.slots.numpy(),
-            volume.codes.numpy().view("<u8").squeeze(-1),
-            volume.resolution,
-            *map(np.float32, (DENSITY_UNIT, DENSITY_STEP, ROUNDING)),
-        )
-        light = np.float32(rays.min_transmittance)
-        results = (lines, voxels, light, sums.numpy(), missing.numpy())
+        fields = _voxels(volume, rays.occupancy), None if second is None else _voxels(second, rays.occupancy), shares
+        results = (lines, *fields, np.float32(rays.min_transmittance), sums.numpy(), missing.numpy())
         parts = even_parts(len(left), -(-len(left) // RAYS_PER_PART))
         run_on_threads(baked_kernels.march_rays, [(left.numpy(), *part, *results) for part in parts])
         found = missing != baked_kernels.NO_CELL
         left = left[found[:, 0]]
         if len(left):
-            volume.fill(_unravel(missing[found], volume.resolution))
+            cells = _unravel(missing[found], volume.resolution)
+            volume.fill(cells)
+            if second is not None:
+                second.fill(cells)
     return composite(sums[:, :5], background), composite(sums[:, 5:], background)
+
+
+def _voxels(volume: BakedVolume, occupancy: Optional[Occupancy]) -> baked_kernels.Voxels:
+    """A volume in the kernels' form."""
+    return baked_kernels.Voxels(
+        ONE_CELL if occupancy is None else occupancy.occupied.numpy(),
+        volume.slots.numpy(),
+        volume.codes.numpy().view("<u8").squeeze(-1),
+        volume.resolution,
+        *map(np.float32, (DENSITY_UNIT, DENSITY_STEP, ROUNDING)),
+    )
 
 
 def _lines(rays: Rays) -> baked_kernels.Lines:

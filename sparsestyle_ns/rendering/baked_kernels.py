@@ -164,25 +164,42 @@ def _interpolate(words, fx, fy, fz):
 
 
 @kernel
-def _transmitted(voxels, code, length, infinite):
-    """exp(−τ) of a sample whose density has this code."""
+def _density(voxels, code):
+    """The density that has this code."""
     if code - _ONE <= voxels.rounding:
+        return _ZERO
+    return voxels.unit * (np.exp(voxels.step * (code - _ONE)) - _ONE)
+
+
+@kernel
+def _transmitted(density, length, infinite):
+    """exp(−τ) of a sample."""
+    if density <= _ZERO:
         return _ONE
-    density = voxels.unit * (np.exp(voxels.step * (code - _ONE)) - _ONE)
     return np.exp(-_DEPTH_CAP if infinite else -min(density * length, _DEPTH_CAP))
 
 
 @kernel
-def march_rays(rays, start, end, lines, voxels, min_transmittance, sums, missing):
+def _between(first, second, share):
+    """From the first at a share of 0 to the second at 1, exactly at both."""
+    return (_ONE - share) * first + share * second
+
+
+@kernel
+def march_rays(rays, start, end, lines, voxels, second, shares, min_transmittance, sums, missing):
     """Adds up the samples of `rays[start:end]`, as `render_packed` does.
 
     Args:
         rays: indices of rays.
-        sums: result, by ray: rgb, Σw and Σws of the stylised field, and the same of the coarse one.
+        voxels: both fields.
+        second: the same with another style, or None; what becomes of None is compiled without it.
+        shares: of the style in the density and in the colour, and of the second style in the style (see `mixing`).
+        sums: result, by ray: rgb, Σw and Σws of the mixed field, and the same of the coarse one.
         missing: result, by place in `rays`: the cells of samples whose corners aren't known yet, by their lower
             corner's index among all voxels. A ray that has any has to be marched again.
     """
     last, top = len(lines.edges) - 2, voxels.resolution
+    density_share, color_share, blend = shares
     for place in range(start, end):
         ray = rays[place]
         if not lines.hit[ray]:
@@ -202,14 +219,24 @@ def march_rays(rays, start, end, lines, voxels, min_transmittance, sums, missing
                 continue
             u, v, w = _scaled(x, top), _scaled(y, top), _scaled(z, top)
             i, j, k = min(int(u), top - 1), min(int(v), top - 1), min(int(w), top - 1)
-            known, code = _interpolate(_words(voxels, i, j, k), u - np.float32(i), v - np.float32(j), w - np.float32(k))
+            fu, fv, fw = u - np.float32(i), v - np.float32(j), w - np.float32(k)
+            known, code = _interpolate(_words(voxels, i, j, k), fu, fv, fw)
+            style_density, style_r, style_g, style_b = _density(voxels, code[1]), code[2], code[3], code[4]
+            if second is not None:
+                both, other = _interpolate(_words(second, i, j, k), fu, fv, fw)
+                known &= both
+                style_density = _between(style_density, _density(second, other[1]), blend)
+                style_r = _between(style_r, other[2], blend)
+                style_g = _between(style_g, other[3], blend)
+                style_b = _between(style_b, other[4], blend)
             if not known:
                 missing[place, lacking] = (i * top + j) * top + k
                 lacking += 1
                 continue
             if lines.bent:
                 length = _length(lines, ray, sample)
-            left = _transmitted(voxels, code[0], length, infinite)
+            density = _density(voxels, code[0])
+            left = _transmitted(density, length, infinite)
             weight = coarse_light * (_ONE - left)
             coarse_light *= left
             coarse_r += weight * code[5]
@@ -217,12 +244,12 @@ def march_rays(rays, start, end, lines, voxels, min_transmittance, sums, missing
             coarse_b += weight * code[7]
             coarse_opacity += weight
             coarse_moment += weight * s
-            left = _transmitted(voxels, code[1], length, infinite)
+            left = _transmitted(_between(density, style_density, density_share), length, infinite)
             weight = light * (_ONE - left)
             light *= left
-            r += weight * code[2]
-            g += weight * code[3]
-            b += weight * code[4]
+            r += weight * _between(code[5], style_r, color_share)
+            g += weight * _between(code[6], style_g, color_share)
+            b += weight * _between(code[7], style_b, color_share)
             opacity += weight
             moment += weight * s
         sums[ray, 0], sums[ray, 1], sums[ray, 2] = _SHADE * r, _SHADE * g, _SHADE * b

@@ -2,11 +2,11 @@
 
 import math
 from dataclasses import dataclass
-from typing import List, Optional, Tuple
+from typing import List, Optional, Sequence, Tuple
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from sparsestyle_ns.field_components.hash_grid import GridLocation
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
@@ -20,6 +20,7 @@ from sparsestyle_ns.rendering.compositing import (
     packed_weights,
 )
 from sparsestyle_ns.rendering.density_grid import Occupancy, PackedSamples, interval_lengths, march
+from sparsestyle_ns.rendering.mixing import STYLISED, Appearance, Mix, mixed
 from sparsestyle_ns.rendering.space import Segments
 
 
@@ -253,12 +254,21 @@ def render_stylised(
 
 
 @torch.no_grad()
-def render_frozen_coarse(
+def render_mixed(
     field: CoarseField,
+    styles: Sequence[nn.Module],
     frozen: FrozenSamples,
     directions: Float[Tensor, "rays 3"],
     background: Optional[Float[Tensor, "3"]],
-) -> PackedRender:
-    """Renders the coarse field at the same frozen samples."""
-    color = field.color(frozen.feature, directions[frozen.samples.ray_indices])
-    return render_packed(frozen.samples, frozen.num_rays, frozen.density, color, background)
+    mix: Mix = STYLISED,
+) -> Tuple[PackedRender, PackedRender]:
+    """The render of a mixture of the fields, by default the stylised one, and the coarse render, at frozen samples.
+
+    Args:
+        styles: one or two fields that give σ_f and c_f, as `ResidualField` does.
+        mix: how much of each field counts.
+    """
+    coarse = Appearance(frozen.density, field.color(frozen.feature, directions[frozen.samples.ray_indices]))
+    found = [Appearance(*style(frozen.location, frozen.feature, frozen.density)) for style in styles]
+    render = render_packed(frozen.samples, frozen.num_rays, *mixed(coarse, found, mix), background)
+    return render, render_packed(frozen.samples, frozen.num_rays, *coarse, background)

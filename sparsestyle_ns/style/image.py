@@ -34,26 +34,37 @@ def load_style_image(path: Union[str, Path], max_side: Optional[int] = None) -> 
             than 8 pixels a side.
     """
     path = Path(path).expanduser()
-    rgb = _read_pixels(path)
+    return decode_style_image(read_bytes(path), path, max_side)
+
+
+def decode_style_image(data: bytes, name: Union[str, Path], max_side: Optional[int] = None) -> Float[Tensor, "3 H W"]:
+    """`load_style_image` of a file's contents.
+
+    Args:
+        data: what is in the file.
+        name: what to call it where something is wrong.
+    """
+    rgb = _decode_pixels(data, name)
     height, width = rgb.shape[:2]
     if min(height, width) < SMALLEST_SIDE:
         raise InputError(
-            f"The style image {path} is {width} × {height} pixels: give one of at least {SMALLEST_SIDE} pixels a side."
+            f"The style image {name} is {width} × {height} pixels: give one of at least {SMALLEST_SIDE} pixels a side."
         )
     if max_side is not None and max(height, width) > max_side:
         scale = max_side / max(height, width)
         size = (round(width * scale), round(height * scale))
         if min(size) < SMALLEST_SIDE:
             raise InputError(
-                f"The style image {path}, {width} × {height} pixels, would be reduced to {size[0]} × {size[1]}: allow "
+                f"The style image {name}, {width} × {height} pixels, would be reduced to {size[0]} × {size[1]}: allow "
                 f"a longer side than {max_side}, or crop it, so that {SMALLEST_SIDE} pixels a side remain."
             )
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
     return torch.from_numpy(rgb).permute(2, 0, 1).contiguous().clamp(0, 1)
 
 
-def _read_pixels(path: Path) -> Float[np.ndarray, "H W 3"]:
-    data = _read_bytes(path)
+def _decode_pixels(data: bytes, name: Union[str, Path]) -> Float[np.ndarray, "H W 3"]:
+    if not data:
+        raise InputError(f"The style image {name} is an empty file: give an undamaged JPEG, PNG or WebP file.")
     try:
         with Image.open(io.BytesIO(data)) as image:
             # Pillow can say what is wrong with a damaged file; OpenCV only that there is no image.
@@ -62,28 +73,30 @@ def _read_pixels(path: Path) -> Float[np.ndarray, "H W 3"]:
             orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
     except UnidentifiedImageError as error:
         raise InputError(
-            f"The style image {path} is in no known image format: give a JPEG, PNG or WebP file."
+            f"The style image {name} is in no known image format: give a JPEG, PNG or WebP file."
         ) from error
     # Decoders meet a damaged file with errors of many kinds: OSError, SyntaxError, struct.error, and others.
     except Exception as error:
         raise InputError(
-            f"The style image {path} cannot be read as an image ({error}): give an undamaged JPEG, PNG or WebP file."
+            f"The style image {name} cannot be read as an image ({error}): give an undamaged JPEG, PNG or WebP file."
         ) from error
     return _turn_upright(_lay_over_white(pixels), orientation)
 
 
-def _read_bytes(path: Path) -> bytes:
+def read_bytes(path: Path) -> bytes:
+    """What is in a style image's file.
+
+    Raises:
+        InputError: there is no such file, or it can't be opened.
+    """
     if path.is_dir():
         raise InputError(f"The style image {path} is a folder: give one image file in it.")
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except FileNotFoundError as error:
         raise InputError(f"The style image {path} does not exist: check the path.") from error
     except OSError as error:
         raise InputError(f"The style image {path} cannot be opened ({error.strerror}): check the path.") from error
-    if not data:
-        raise InputError(f"The style image {path} is an empty file: give an undamaged JPEG, PNG or WebP file.")
-    return data
 
 
 def _is_deep_png(data: bytes) -> bool:

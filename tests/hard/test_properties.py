@@ -34,6 +34,7 @@ from sparsestyle_ns.rendering import (
     compositing,
     density_grid,
     frozen_view,
+    mixing,
     ndc,
     precision,
     sampling,
@@ -317,7 +318,7 @@ def tiny_fields(seed, bias):
     volume.accumulation_of,
     volume.render_packed,
     volume.render_stylised,
-    volume.render_frozen_coarse,
+    volume.render_mixed,
     precision.autocast,
     precision.multiplies_bfloat16,
     precision.multiplies_tf32,
@@ -345,8 +346,9 @@ def test_renders_of_any_field_are_pictures(seed, scene, rays, steps, bias, numbe
             field, residual, density_grid.Occupancy(2), segments, steps, layout.unbounded, min_transmittance=1e-3
         )
         stylised = volume.render_stylised(residual, frozen, background)
-        again = volume.render_frozen_coarse(field, frozen, directions, background)
+        also, again = volume.render_mixed(field, [residual], frozen, directions, background)
     (coarse.rgb.square().sum() + stylised.rgb.square().sum()).backward()
+    assert torch.equal(also.rgb, stylised.rgb)
     for render in (coarse, stylised, again):
         assert (render.rgb >= -1e-6).all() and (render.rgb <= 1 + 1e-5).all()
         assert (render.accumulation <= 1 + 1e-6).all() and (render.s >= 0).all() and (render.s <= 1 + 1e-5).all()
@@ -390,6 +392,18 @@ def test_baked_renders_are_pictures(seed, scene, rays, steps, resolution):
         assert (left.rgb >= -1e-6).all() and (left.rgb <= 1 + 1e-5).all()
         # A sample within rounding of a cell's border, or of 1e-3 of the light, may count in one of them alone.
         torch.testing.assert_close(left.accumulation, right.accumulation, rtol=0, atol=2e-3)
+
+
+@covers(mixing.interpolate, mixing.mixed)
+@given(SEEDS, COUNTS, st.floats(0, 1), st.floats(0, 1), st.floats(0, 1), st.floats(-10, 30))
+def test_mixtures_of_fields_lie_between_them(seed, count, strength, geometry, blend, log_density):
+    generator = torch.Generator().manual_seed(seed)
+    densities = torch.rand(3, count, generator=generator) * 10.0**log_density
+    colors = torch.rand(3, count, 3, generator=generator)
+    coarse, *styles = map(mixing.Appearance, densities, colors)
+    found = mixing.mixed(coarse, styles, mixing.Mix(strength, geometry, blend))
+    for values, result in ((densities, found.density), (colors, found.color)):
+        assert (result >= values.amin(dim=0) * (1 - 1e-5)).all() and (result <= values.amax(dim=0) * (1 + 1e-5)).all()
 
 
 @covers(frozen_view.split_by_samples)
@@ -586,7 +600,7 @@ def test_transferred_colours_have_the_styles_mean(data, count, style_count, dtyp
     assert (cut >= 0).all() and (cut <= 1).all()
 
 
-@covers(image.load_style_image)
+@covers(image.load_style_image, image.read_bytes, image.decode_style_image)
 @given(
     arrays.arrays(
         st.sampled_from([np.uint8, np.uint16]),
@@ -602,6 +616,7 @@ def test_pictures_are_read_as_they_were_written(tmp_path_factory, pixels, max_si
     assume(max_side is None or min(pixels.shape) * max_side >= 8 * max(pixels.shape))
     read = image.load_style_image(path, max_side)
     assert read.dtype == torch.float32 and read.min() >= 0 and read.max() <= 1
+    assert torch.equal(image.decode_style_image(image.read_bytes(path), path.name, max_side), read)
     if max_side is None:
         expected = torch.from_numpy(pixels.astype(np.float32) / largest)
         torch.testing.assert_close(read, expected.expand(3, -1, -1))

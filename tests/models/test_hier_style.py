@@ -1,4 +1,5 @@
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -7,8 +8,10 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 from torch.nn.functional import normalize
 
+from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
-from sparsestyle_ns.models.hier_style import HierStyleModelConfig
+from sparsestyle_ns.models.hier_style import MOST_BAKED, HierStyleModelConfig, Look
+from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.trainer import FusedAdamConfig
 
 BOX = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
@@ -60,7 +63,7 @@ def model():
 @torch.no_grad()
 def render(model, mode=None):
     if mode is not None:
-        model.render_mode.value = mode
+        model.look = replace(model.look, mode=mode)
     generator = torch.Generator().manual_seed(0)
     origins = 3 * normalize(torch.randn(50, 3, generator=generator), dim=-1)
     aim = torch.rand(50, 3, generator=generator) - 0.5
@@ -76,7 +79,7 @@ def assert_close(found, expected, tolerance=0.02):
 
 
 def volume(model):
-    return model._baked[0]
+    return model._baked[model.residual][0]
 
 
 def test_a_baked_picture_is_nearly_the_exact_one_and_exact_is_the_default(model):
@@ -87,7 +90,7 @@ def test_a_baked_picture_is_nearly_the_exact_one_and_exact_is_the_default(model)
 
 def test_exact_pictures_bake_nothing(model):
     render(model, "exact")
-    assert model._baked is None
+    assert not model._baked
 
 
 def test_a_baked_model_has_the_state_of_an_exact_one(model):
@@ -144,7 +147,7 @@ def test_another_coarse_field_is_seen_in_the_next_picture(model):
 
 def test_pictures_are_exact_while_the_model_trains(model):
     found = render(model.train())
-    assert model._baked is None
+    assert not model._baked
     assert_close(found, render(make_model()), tolerance=0)
 
 
@@ -155,10 +158,6 @@ def test_a_coarse_colour_that_depends_on_the_direction_is_baked_as_its_mean_and_
     for key, value in expected.items():
         torch.testing.assert_close(found[key], value, atol=0.02, rtol=0, msg=key)
     assert 0 < (colors[0] - colors[1]).abs().mean() < 0.1
-
-
-def test_the_viewers_control_begins_with_the_configs_mode_and_offers_both(model):
-    assert (model.render_mode.value, model.render_mode.options) == ("baked", ["exact", "baked"])
 
 
 def test_a_coarse_field_that_is_fine_tuned_starts_as_it_is_and_alone_learns():
@@ -190,6 +189,98 @@ def test_the_residual_field_sees_what_the_config_says_beside_the_coarse_feature(
 
 def test_a_picture_in_one_mode_leaves_the_models_own_as_it_was(model):
     with pytest.raises(RuntimeError), model.rendering("exact"):
-        assert model.render_mode.value == "exact"
+        assert model.look.mode == "exact"
         raise RuntimeError
-    assert model.render_mode.value == "baked"
+    assert model.look.mode == "baked"
+
+
+BOTH_MODES = pytest.mark.parametrize("mode", ["exact", "baked"])
+PARTS = ("rgb", "accumulation", "depth")
+
+
+def shown(model, mode, *styles, **mix):
+    model.look = Look(mode, Mix(**mix), styles or None)
+    return render(model)
+
+
+def another_style(model):
+    style = model.new_style()
+    with torch.no_grad():
+        style.grid.table.uniform_(-1, 1)
+        torch.nn.init.normal_(style.density_head.weight, std=0.1)
+        torch.nn.init.normal_(style.color_head.weight)
+    return style
+
+
+@BOTH_MODES
+def test_strength_goes_from_the_coarse_picture_to_the_stylised_one_exactly(model, mode):
+    stylised = shown(model, mode)
+    coarse = shown(model, mode, strength=0.0)
+    between = shown(model, mode, strength=0.5)
+    assert (stylised["rgb"] - coarse["rgb"]).abs().max() > 0.1
+    for name in PARTS:
+        assert torch.equal(coarse[name], stylised[f"{name}_coarse"])
+        assert torch.equal(between[f"{name}_coarse"], stylised[f"{name}_coarse"])
+    assert 0.01 < (between["rgb"] - coarse["rgb"]).abs().max() < (stylised["rgb"] - coarse["rgb"]).abs().max() + 0.1
+
+
+@BOTH_MODES
+def test_without_geometry_strength_the_geometry_is_the_coarse_one_and_the_colour_is_the_styles(model, mode):
+    stylised, painted = shown(model, mode), shown(model, mode, geometry=0.0)
+    torch.testing.assert_close(painted["accumulation"], stylised["accumulation_coarse"], rtol=0, atol=1e-6)
+    torch.testing.assert_close(painted["depth"], stylised["depth_coarse"], rtol=0, atol=1e-5)
+    assert (stylised["accumulation"] - painted["accumulation"]).abs().max() > 1e-3
+    assert (painted["rgb"] - stylised["rgb_coarse"]).abs().max() > 0.1
+
+
+@BOTH_MODES
+def test_a_blend_goes_from_one_style_to_the_other_exactly(model, mode):
+    first, second = model.residual, another_style(model)
+    ends = [shown(model, mode, each) for each in (first, second)]
+    assert (ends[0]["rgb"] - ends[1]["rgb"]).abs().max() > 0.1
+    for blend, expected in zip((0.0, 1.0), ends, strict=True):
+        found = shown(model, mode, first, second, blend=blend)
+        assert all(torch.equal(found[name], expected[name]) for name in expected)
+    half = [shown(model, mode, *pair, blend=share) for pair, share in (((first, second), 0.3), ((second, first), 0.7))]
+    for name in PARTS:
+        torch.testing.assert_close(half[0][name], half[1][name], rtol=1e-5, atol=1e-5)
+
+
+def test_baked_mixtures_are_nearly_the_exact_ones(model):
+    second = another_style(model)
+    mix = {"strength": 0.7, "geometry": 0.4, "blend": 0.25}
+    exact, baked = (shown(model, mode, model.residual, second, **mix) for mode in ("exact", "baked"))
+    assert_close(baked, exact)
+
+
+def test_moving_a_slider_evaluates_no_field(model, monkeypatch):
+    second = another_style(model)
+    shown(model, "baked", model.residual, second, blend=0.5)
+    for part in (model.field, model.residual, second):
+        monkeypatch.setattr(part, "forward", None)
+    monkeypatch.setattr(model.field, "density_and_feature", None)
+    for mix in ({"strength": 0.2}, {"geometry": 0.1}, {"blend": 0.9}):
+        shown(model, "baked", model.residual, second, **mix)
+
+
+def test_only_so_many_styles_stay_baked_the_latest_ones(model):
+    styles = [model.residual, *(another_style(model) for _ in range(MOST_BAKED))]
+    for style in styles:
+        shown(model, "baked", style)
+    assert list(model._baked) == styles[1:]
+
+
+def test_a_run_shows_the_strengths_in_its_config_and_training_shows_none(model):
+    weak = make_model(strength=0.0)
+    assert torch.equal(render(weak)["rgb"], render(weak)["rgb_coarse"])
+    frozen = weak.freeze(torch.tensor([[-3.0, 0.1, 0.2]]), torch.tensor([[1.0, 0.0, 0.0]]))
+    assert torch.equal(weak.stylised(frozen).rgb, model.stylised(frozen).rgb)
+    with pytest.raises(InputError, match=r"--pipeline\.model\.geometry-strength is 1\.5; give a number from 0 to 1"):
+        make_model(geometry_strength=1.5)
+
+
+def test_a_new_style_is_no_part_of_the_model_and_starts_on_the_coarse_geometry(model):
+    names = set(model.state_dict())
+    found = shown(model, "exact", model.new_style())
+    assert set(model.state_dict()) == names
+    assert torch.equal(found["depth"], found["depth_coarse"])

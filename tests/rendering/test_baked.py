@@ -299,7 +299,7 @@ def test_a_volume_without_cells_is_refused():
 def test_segments_of_another_kind_have_no_compiled_form():
     class Spiral(Segments):
         hit = torch.ones(1, dtype=torch.bool)
-        positions = lengths = distance = None
+        positions = lengths = distance = at_distance = None
 
     with pytest.raises(TypeError, match="march_in_torch"):
         march_compiled(volume_of(trilinear), Rays(Spiral(), Occupancy(4), STEPS, False, 0.0), None)

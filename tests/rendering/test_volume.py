@@ -19,7 +19,7 @@ from sparsestyle_ns.rendering.volume import (
     mean_position,
     over_background,
     render_coarse,
-    render_frozen_coarse,
+    render_mixed,
     render_stylised,
 )
 
@@ -137,7 +137,7 @@ def test_the_coarse_view_is_the_slow_one_dense_and_packed(space, background, coa
     assert_render(dense, expected)
     torch.testing.assert_close(dense.weights.sum(dim=-1, keepdim=True), dense.accumulation)
     frozen = freeze(coarse, residual, rays, space)
-    assert_render(render_frozen_coarse(coarse, frozen, rays[1], color), expected)
+    assert_render(render_mixed(coarse, [residual], frozen, rays[1], color)[1], expected)
     torch.testing.assert_close(accumulation_of(frozen), dense.accumulation)
 
 
@@ -160,10 +160,8 @@ def test_skipping_cells_that_are_empty_does_not_change_the_picture(ball, residua
     assert 0 < occupancy.share < 0.5
     everything, skipped = freeze(ball, residual, rays), freeze(ball, residual, rays, occupancy=occupancy)
     assert 0 < len(skipped.density) < 0.7 * len(everything.density)
-    for one, other in (
-        (render_stylised(residual, everything, WHITE), render_stylised(residual, skipped, WHITE)),
-        (render_frozen_coarse(ball, everything, rays[1], WHITE), render_frozen_coarse(ball, skipped, rays[1], WHITE)),
-    ):
+    pictures = (render_mixed(ball, [residual], frozen, rays[1], WHITE) for frozen in (everything, skipped))
+    for one, other in zip(*pictures, strict=True):
         assert one.accumulation.max() > 0.5
         for field in fields(one):
             torch.testing.assert_close(getattr(other, field.name), getattr(one, field.name))

@@ -1,0 +1,65 @@
+"""What lies between the coarse field and a stylised one, and between two styles of the same scene.
+
+σ_c and c_c are the coarse field's density and colour at a point, σ_f and c_f a stylised field's. A picture with
+strength s, geometry strength g and blend b of two styles, 0 and 1, shows
+
+    σ = (1 − s g) σ_c + s g [(1 − b) σ_f⁰ + b σ_f¹],      c = (1 − s) c_c + s [(1 − b) c_f⁰ + b c_f¹].
+
+So strength 0 is the coarse field, strength and geometry strength 1 a stylised one, and geometry strength 0 a stylised
+colour on the coarse geometry. What a field of the kind of Eq. 3 adds to the density is σ_f − σ_c, the residual density
+as far as it takes effect; it is that, and not σ' itself, that s g weighs: a negative σ_c + s g σ' can't come up, and
+values that were worked out for one picture serve every other strength.
+"""
+
+from typing import NamedTuple, Sequence
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+class Mix(NamedTuple):
+    """How much of each field a picture shows; all in [0, 1].
+
+    Attributes:
+        strength: s, from the coarse field to a stylised one.
+        geometry: g, the share of the residual density that comes with the style.
+        blend: b, from the first style to the second; means nothing with one style.
+    """
+
+    strength: float = 1.0
+    geometry: float = 1.0
+    blend: float = 0.0
+
+    @property
+    def density_share(self) -> float:
+        """s g, the share of σ that is the style's."""
+        return self.strength * self.geometry
+
+
+STYLISED = Mix()
+"""The stylised field as it is."""
+
+
+class Appearance(NamedTuple):
+    """σ and c of a field at points."""
+
+    density: Float[Tensor, "points"]
+    color: Float[Tensor, "points 3"]
+
+
+def interpolate(first: Float[Tensor, "*batch"], second: Float[Tensor, "*batch"], share: float) -> Tensor:
+    """(1 − share) first + share second; the very same tensor at a share of 0 or 1."""
+    if share == 0.0:
+        return first
+    return second if share == 1.0 else (1.0 - share) * first + share * second
+
+
+def mixed(coarse: Appearance, styles: Sequence[Appearance], mix: Mix) -> Appearance:
+    """σ and c of a picture (see the formulas above), from those of the coarse field and of one or two styles."""
+    density, color = styles[0]
+    if len(styles) > 1:
+        density = interpolate(density, styles[1].density, mix.blend)
+        color = interpolate(color, styles[1].color, mix.blend)
+    return Appearance(
+        interpolate(coarse.density, density, mix.density_share), interpolate(coarse.color, color, mix.strength)
+    )

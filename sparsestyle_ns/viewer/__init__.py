@@ -1,0 +1,1 @@
+"""The "Style" panel of nerfstudio's viewer, and what it does."""

@@ -1,0 +1,105 @@
+"""Baked volumes filled ahead, on a CPU: what cameras near the photos see is there when they come.
+
+A camera that sees a place for the first time waits for the fields to be evaluated there, most of a second on two cores;
+one that sees it again doesn't. So the time in which nobody moves anything goes to places that are likely to be seen.
+"""
+
+import threading
+import time
+from typing import Any, Callable, ContextManager, Iterator, List, Optional, Tuple
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.camera_utils import get_interpolated_poses
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor, nn
+
+SIDE = 252
+"""Longer side of the pictures whose voxels are filled in: with a volume of 256 cells a side, one ray for each cell."""
+STEPS_BETWEEN = 4
+"""Cameras on the way from each photo's to the next one's."""
+RAYS_AT_ONCE = 1024
+"""Between so many, about a tenth of a second on two cores, the viewer's own pictures get their turn."""
+
+
+def likely_cameras(cameras: Cameras) -> List[Cameras]:
+    """Cameras that a viewer is likely to pass: those of the photos, then those on the way from each to the next."""
+    scale = SIDE / max(int(cameras.width.max()), int(cameras.height.max()))
+    between = []
+    for first, second in zip(range(len(cameras)), range(1, len(cameras)), strict=False):
+        ends = (cameras.camera_to_worlds[index].cpu().numpy() for index in (first, second))
+        poses = get_interpolated_poses(*ends, STEPS_BETWEEN + 2)[1:-1]
+        between += [cameras.camera_to_worlds.new_tensor(pose)[:3] for pose in poses]
+    poses = [*cameras.camera_to_worlds, *between]
+    found = [
+        Cameras(
+            camera_to_worlds=pose[None],
+            **{name: getattr(cameras, name)[:1] for name in ("fx", "fy", "cx", "cy", "width", "height")},
+        )
+        for pose in poses
+    ]
+    for camera in found:
+        camera.rescale_output_resolution(scale)
+    return found
+
+
+class Baker(threading.Thread):
+    """Fills the volumes of the styles that are shown, for as long as there is something to fill and time for it.
+
+    Args:
+        model: the `HierStyleModel`.
+        cameras: of the photos.
+        shown: the styles on the screen.
+        is_free: whether the processor has nothing else to do.
+        lock: that the viewer's pictures are made under.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        cameras: Cameras,
+        shown: Callable[[], Tuple[nn.Module, ...]],
+        is_free: Callable[[], bool],
+        lock: ContextManager,
+    ) -> None:
+        super().__init__(name="baking", daemon=True)
+        self.model, self.shown, self.is_free, self.lock = model, shown, is_free, lock
+        self.cameras = likely_cameras(cameras)
+        self.filled: List[Tuple[nn.Module, int]] = []
+        """Styles and cameras whose rays have all been followed."""
+
+    def run(self) -> None:
+        """Works until the process ends."""
+        while True:
+            task = self._next()
+            if task is None or not self.is_free():
+                time.sleep(0.1)
+                continue
+            style, number = task
+            if all(self._follow(style, *rays) for rays in _rays(self.cameras[number], self.model.device)):
+                self.filled.append(task)
+
+    def is_done(self) -> bool:
+        """Whether all is filled that the styles on the screen need."""
+        return self._next() is None
+
+    def _next(self) -> Optional[Tuple[nn.Module, int]]:
+        tasks = ((style, number) for number in range(len(self.cameras)) for style in self.shown())
+        return next((task for task in tasks if task not in self.filled), None)
+
+    @torch.no_grad()
+    def _follow(self, style: nn.Module, origins: Tensor, directions: Tensor) -> bool:
+        """Fills what these rays meet, once there is time; False where the style isn't shown any more."""
+        while not self.is_free():
+            time.sleep(0.1)
+        if style not in self.shown():
+            return False
+        with self.lock:
+            self.model.fill_baked(origins, directions, style)
+        time.sleep(0.005)  # whoever waits for the lock gets it
+        return True
+
+
+def _rays(camera: Cameras, device: torch.device) -> Iterator[Tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]]:
+    bundle = camera.to(device).generate_rays(camera_indices=0, keep_shape=False).flatten()
+    return zip(bundle.origins.split(RAYS_AT_ONCE), bundle.directions.split(RAYS_AT_ONCE), strict=True)

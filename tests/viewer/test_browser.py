@@ -1,0 +1,235 @@
+"""ns-viewer on a real run, looked at and acted in through a browser."""
+
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Iterator
+
+import numpy as np
+import pytest
+from chromium import Tab, needs_chromium, open_tab
+from conftest import run_entrypoint
+
+WIDTH, HEIGHT = 900, 700
+SCRIPT = "from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"
+PATIENCE = 120
+"""Seconds until something that doesn't happen counts as not happening; the first pictures compile kernels."""
+
+HELPERS = """
+window.leaf = text => [...document.querySelectorAll('label, div, p, span, button')]
+  .filter(e => e.innerText && e.innerText.trim() === text).pop();
+window.near = (text, selector) => {
+  for (let e = leaf(text); e; e = e.parentElement) {
+    const found = e.querySelector(selector);
+    if (found) return found;
+  }
+};
+0
+"""
+"""Finds the innermost element that says something, and the control beside it."""
+
+
+class Page:
+    """The viewer's page."""
+
+    def __init__(self, tab: Tab, address: str) -> None:
+        self.tab = tab
+        tab.open(address)
+        tab.evaluate(HELPERS)
+        self.wait_for("!!leaf('Strength')")
+
+    def wait_for(self, expression: str) -> None:
+        """Until a JavaScript expression is true."""
+        end = time.monotonic() + PATIENCE
+        while not self.tab.evaluate(expression):
+            assert time.monotonic() < end, f"{expression} never came true; the page says: " + self.text()
+            time.sleep(0.2)
+
+    def text(self) -> str:
+        """What the page says."""
+        return self.tab.evaluate("document.body.innerText")
+
+    def click(self, text: str) -> None:
+        """Clicks what says this."""
+        self.wait_for(f"!!leaf({json.dumps(text)})")
+        self.tab.evaluate(f"leaf({json.dumps(text)}).click()")
+
+    def press(self, key: str) -> None:
+        """A key, in whatever has the focus."""
+        for kind in ("keyDown", "keyUp"):
+            self.tab.call("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+
+    def slide(self, label: str, key: str) -> None:
+        """Moves a slider by the keyboard: Home, End, ArrowLeft …"""
+        self.tab.evaluate(f"near({json.dumps(label)}, '[role=slider]').focus()")
+        self.press(key)
+
+    def write(self, label: str, text: str) -> None:
+        """Replaces what is in a text field."""
+        self.tab.evaluate(f"(e => {{ e.focus(); e.select(); }})(near({json.dumps(label)}, 'input'))")
+        self.tab.call("Input.insertText", text=text)
+
+    def give(self, label: str, path: Path) -> None:
+        """Chooses a file for an upload button."""
+        self.wait_for(f"!!leaf({json.dumps(label)})")
+        found = self.tab.call("Runtime.evaluate", expression=f"near({json.dumps(label)}, 'input[type=file]')")
+        self.tab.call("DOM.setFileInputFiles", files=[str(path)], objectId=found["result"]["objectId"])
+
+    def scene(self) -> np.ndarray:
+        """The pixels left of the panel, once they are there and have come to rest."""
+        before, since, end = self._pixels(), time.monotonic(), time.monotonic() + PATIENCE
+        while time.monotonic() - since < 2.0 or not self._is_still():
+            assert time.monotonic() < end, "there is no picture, or none that comes to rest"
+            time.sleep(0.3)
+            now = self._pixels()
+            if np.abs(now - before).mean() > 0.5:
+                before, since = now, time.monotonic()
+        return before
+
+    def _is_still(self) -> bool:
+        """Whether the picture is a still one: while something moves, its longer side is smaller."""
+        size = re.search(r"Resolution: (\d+)x(\d+)px", self.text())
+        return size is not None and max(map(int, size.groups())) in (256, 512)  # on a CPU, on a GPU
+
+    def _pixels(self) -> np.ndarray:
+        return self.tab.screenshot()[80:620, 20:520].astype(float)
+
+
+def difference(first: np.ndarray, second: np.ndarray) -> float:
+    """Mean difference of pixels, of 255."""
+    return float(np.abs(first - second).mean())
+
+
+@pytest.fixture(scope="module")
+def server(patterned_run: Path) -> Iterator[SimpleNamespace]:
+    """ns-viewer in a process of its own."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-c", SCRIPT, "--load-config", str(patterned_run / "config.yml")]
+    command += ["--viewer.websocket-port", str(port), "--viewer.websocket-host", "127.0.0.1"]
+    log = patterned_run.parent / "viewer.log"
+    address = f"http://127.0.0.1:{port}"
+    with open(log, "w") as output, subprocess.Popen(command, stdout=output, stderr=output) as process:
+        try:
+            end = time.monotonic() + PATIENCE
+            while not answers(address):
+                assert process.poll() is None and time.monotonic() < end, log.read_text()
+                time.sleep(0.3)
+            yield SimpleNamespace(address=address, process=process, log=log, run=patterned_run)
+        finally:
+            process.kill()
+
+
+def answers(address: str) -> bool:
+    try:
+        with urllib.request.urlopen(address, timeout=5) as answer:
+            return answer.status == 200
+    except OSError:
+        return False
+
+
+@pytest.fixture(scope="module")
+def page(server: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with open_tab(tmp_path_factory.mktemp("profile"), WIDTH, HEIGHT) as tab:
+        yield Page(tab, server.address)
+
+
+@needs_chromium
+def test_the_picture_arrives_and_sliders_change_it(page: Page) -> None:
+    stylised = page.scene()
+    assert stylised.std() > 10
+    page.slide("Strength", "Home")
+    coarse = page.scene()
+    assert difference(stylised, coarse) > 5
+    page.slide("Strength", "End")
+    assert difference(page.scene(), stylised) < 2
+    page.slide("Geometry", "Home")
+    painted = page.scene()
+    assert difference(painted, stylised) > 2 and difference(painted, coarse) > 2
+    page.slide("Geometry", "End")
+    assert difference(page.scene(), stylised) < 2
+
+
+@needs_chromium
+def test_nothing_in_the_panel_is_wider_than_the_panel(page: Page) -> None:
+    page.click("Effects of this scene")
+    time.sleep(1.0)
+    panel = "leaf('Strength').closest('.mantine-ScrollArea-viewport')"
+    assert page.tab.evaluate(f"{panel}.scrollWidth <= {panel}.clientWidth + 2")
+    assert "Error" not in page.text()
+    page.click("Effects of this scene")
+
+
+@needs_chromium
+def test_the_split_shows_the_coarse_field_on_the_left(page: Page) -> None:
+    stylised = page.scene()
+    page.tab.evaluate("near('Coarse | stylised', 'input[type=checkbox]').click()")
+    split = page.scene()
+    page.slide("Strength", "Home")
+    coarse = page.scene()
+    assert difference(split, stylised) > 2 and difference(split, coarse) > 2
+    # Nothing but the right hand side depends on the strength; the divider is in the middle of the window.
+    left = slice(0, WIDTH // 2 - 40)
+    assert difference(split[:, left], coarse[:, left]) < 1
+    page.slide("Strength", "End")
+    page.tab.evaluate("near('Coarse | stylised', 'input[type=checkbox]').click()")
+    assert difference(page.scene(), stylised) < 2
+
+
+@needs_chromium
+def test_a_bad_image_gets_a_sentence_and_another_one_a_new_picture(
+    page: Page, server: SimpleNamespace, tmp_path: Path, painting: Path
+) -> None:
+    before = page.scene()
+    page.click("Another style")
+    bad = tmp_path / "broken.png"
+    bad.write_text("no picture")
+    page.give("Upload and restyle", bad)
+    page.wait_for("document.body.innerText.includes('broken.png is in no known image format')")
+    assert difference(page.scene(), before) < 2
+    page.write("Image", str(painting))
+    page.click("Restyle")
+    page.wait_for("document.body.innerText.includes('is ready. Saved as a run of its own')")
+    after = page.scene()
+    assert difference(before, after) > 5
+    assert server.process.poll() is None and "Traceback" not in server.log.read_text()
+
+
+@needs_chromium
+def test_a_camera_path_made_in_the_viewer_renders(
+    page: Page, server: SimpleNamespace, llff_scene: Path, tmp_path: Path
+) -> None:
+    from nerfstudio.scripts import render
+
+    page.click("Render")
+    for _ in range(2):
+        page.click("Add Keyframe")
+        time.sleep(1.0)
+    page.click("Generate Command")
+    page.wait_for("document.body.innerText.includes('ns-render camera-path')")
+    words = page.tab.evaluate(
+        "[...document.querySelectorAll('code')].map(e => e.innerText).find(t => t.includes('ns-render'))"
+    )
+    arguments = words.split()
+    assert arguments[:2] == ["ns-render", "camera-path"]
+    output = arguments.index("--output-path") + 1
+    arguments[output] = str(tmp_path / "pictures")
+    # A sixtieth of full HD; only the command's output goes elsewhere.
+    small = ["--output-format", "images", "--downscale-factor", "60"]
+    before = os.getcwd()
+    try:
+        os.chdir(tmp_path)
+        run_entrypoint(render.entrypoint, [*arguments[1:], *small])
+    finally:
+        os.chdir(before)
+    pictures = list((tmp_path / "pictures").rglob("*.jpg"))
+    path = json.loads(next((llff_scene / "camera_paths").glob("*.json")).read_text())
+    assert len(pictures) == len(path["camera_path"]) > 1

@@ -1,0 +1,323 @@
+"""The Style panel, in nerfstudio's own viewer but without a browser: its controls are moved from here."""
+
+import io
+import json
+import os
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Callable, Iterator, List
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from conftest import run_entrypoint
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from nerfstudio.viewer.viewer import Viewer
+from PIL import Image
+
+from sparsestyle_ns.evaluation.training import Training
+from sparsestyle_ns.run_folder import find_config, load_run
+from sparsestyle_ns.viewer.baking import STEPS_BETWEEN
+from sparsestyle_ns.viewer.panel import NO_BLEND, StylePanel
+from sparsestyle_ns.viewer.restyling import Restyling, Workshop
+from sparsestyle_ns.viewer.styles import StyleImage, free_name, plain
+
+
+class Drawing(RenderStateMachine):
+    """One of the viewer's threads, which does what the test says."""
+
+    def __init__(self, work: Callable[[], object]) -> None:
+        threading.Thread.__init__(self, daemon=True)
+        self.work = work
+
+    def run(self) -> None:
+        self.result = self.work()
+
+
+def drawn(panel: StylePanel, output: str = "rgb") -> torch.Tensor:
+    """A picture as the viewer makes it."""
+    pipeline = panel.pipeline
+    camera = pipeline.datamanager.train_dataset.cameras[:1]
+    thread = Drawing(lambda: pipeline.model.get_outputs_for_camera(camera)[output])
+    thread.start()
+    thread.join()
+    return thread.result
+
+
+@contextmanager
+def viewer_of(run: Path) -> Iterator[StylePanel]:
+    """The panel of a run in a viewer like ns-viewer's."""
+    _, pipeline, _ = load_run(find_config(run))
+    config = ViewerConfig(websocket_host="127.0.0.1")
+    viewer = Viewer(config, run / "viewer.txt", run, pipeline, train_lock=threading.Lock())
+    try:
+        yield pipeline.panel
+    finally:
+        viewer.viser_server.stop()
+
+
+@pytest.fixture(scope="module")
+def panel(patterned_run: Path) -> Iterator[StylePanel]:
+    with viewer_of(patterned_run) as panel:
+        yield panel
+
+
+@pytest.fixture(autouse=True)
+def at_rest(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Puts the controls back afterwards."""
+    yield
+    if "panel" in request.fixturenames:
+        panel = request.getfixturevalue("panel")
+        panel.strength.value = panel.geometry.value = 1.0
+        panel.style.value, panel.other.value, panel.split.value = panel.styles[0].name, NO_BLEND, False
+
+
+def wait_for(panel: StylePanel) -> str:
+    """What the panel says when it has done what it does."""
+    end = time.monotonic() + 60
+    while panel._busy.locked():
+        assert time.monotonic() < end, panel.message.content
+        time.sleep(0.05)
+    return shown_text(panel.message.content)
+
+
+def shown_text(markdown: str) -> str:
+    """What a browser shows of escaped text."""
+    return markdown.replace("<wbr />", "").replace("\\", "")
+
+
+def png(seed: int) -> bytes:
+    file = io.BytesIO()
+    colors = np.random.default_rng(seed).integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    Image.fromarray(colors).resize((64, 48)).save(file, format="PNG")
+    return file.getvalue()
+
+
+def test_sliders_change_the_viewers_picture_and_no_other(panel: StylePanel) -> None:
+    camera = panel.pipeline.datamanager.train_dataset.cameras[:1]
+    own = panel.pipeline.model.get_outputs_for_camera(camera)["rgb"]
+    stylised = drawn(panel)
+    panel.strength.value = 0.0
+    assert torch.equal(drawn(panel), drawn(panel, "rgb_coarse"))
+    assert (stylised - drawn(panel)).abs().max() > 0.1
+    assert torch.equal(panel.pipeline.model.get_outputs_for_camera(camera)["rgb"], own)
+    panel.strength.value, panel.geometry.value = 1.0, 0.0
+    assert torch.equal(drawn(panel, "depth"), drawn(panel, "depth_coarse"))
+
+
+def test_without_a_gpu_the_viewer_begins_with_baked_pictures(panel: StylePanel) -> None:
+    assert panel.mode.value == "baked" and panel.mode.options == ["exact", "baked"]
+    drawn(panel)
+    assert panel.pipeline.model.residual in panel.pipeline.model._baked
+
+
+def test_volumes_are_filled_ahead_for_the_photos_cameras_and_those_between(
+    panel: StylePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sparsestyle_ns.viewer.panel.SECONDS_UNTIL_BAKING", 0.0)
+    end = time.monotonic() + 60
+    while not panel.baker.is_done():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert len(panel.baker.cameras) == 3 + 2 * STEPS_BETWEEN
+    monkeypatch.setattr(panel.pipeline.model.field, "density_and_feature", None)
+    bundle = panel.baker.cameras[-1].generate_rays(camera_indices=0, keep_shape=True)
+    thread = Drawing(lambda: panel.pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"])
+    thread.start()
+    thread.join()
+    assert max(thread.result.shape) == 252 and thread.result.std() > 0.05
+
+
+def test_the_panel_says_what_made_the_style(panel: StylePanel) -> None:
+    text = shown_text(panel.description.content)
+    assert "![painting](data:image/jpeg;base64," in text
+    assert "**Painting** painting.png" in text and "**Iterations** 3" in text
+    assert "**Features** vgg16" in text and "coarse-fewshot" in text.split("**Coarse run**")[1]
+
+
+def test_the_split_shows_coarse_and_stylised_and_stays_for_the_next_browser(panel: StylePanel) -> None:
+    control_panel = panel.viewer.control_panel
+    assert control_panel.output_render == "rgb" and not control_panel.split
+    panel.split.value = True
+    panel._apply_split()
+    control_panel.update_output_options(list(control_panel._output_render.options))  # as for each new browser
+    assert (control_panel.output_render, control_panel.split_output_render) == ("rgb_coarse", "rgb")
+    assert control_panel.split
+
+
+@pytest.mark.parametrize(
+    "data, complaint",
+    [
+        (b"", "The style image upload.png is an empty file"),
+        (b"this is no picture", "The style image upload.png is in no known image format"),
+        (png(0)[:200], "The style image upload.png cannot be read as an image"),
+    ],
+)
+def test_a_bad_upload_is_refused_in_a_sentence(panel: StylePanel, data: bytes, complaint: str) -> None:
+    before = drawn(panel)
+    panel.upload.received("../upload.png", data)
+    said = wait_for(panel)
+    assert said.startswith(f"**Not restyled.** {complaint}") and "\n" not in said
+    assert torch.equal(drawn(panel), before) and len(panel.styles) == 1
+
+
+@pytest.mark.parametrize(
+    "path, complaint",
+    [
+        ("", "There is no image: write a path"),
+        ("/nowhere/painting.png", "The style image /nowhere/painting.png does not exist"),
+        ("/", "The style image / is a folder"),
+        (os.devnull, "is no file"),
+        ("\0", "Something went wrong in restyling"),
+    ],
+)
+def test_a_bad_path_is_refused_in_a_sentence(panel: StylePanel, path: str, complaint: str) -> None:
+    panel.path.value = path
+    panel.start.cb_hook(panel.start)
+    assert complaint in wait_for(panel) and len(panel.styles) == 1
+
+
+def test_an_error_in_the_middle_leaves_the_style_on_the_screen(
+    panel: StylePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(panel.pipeline, "step", fail)
+    panel.upload.received("a.png", png(1))
+    assert "RuntimeError: out of memory" in wait_for(panel)
+    assert len(panel.styles) == 1 and drawn(panel).isfinite().all()
+    assert not panel.stop.gui_handle.visible and not panel.bar.gui_handle.visible
+
+
+def test_a_restyling_can_be_stopped_and_only_one_runs_at_a_time(
+    panel: StylePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on = threading.Event()
+    monkeypatch.setattr(panel, "_let_pictures_pass", lambda: go_on.wait(30))
+    panel.upload.received("a.png", png(1))
+    panel.upload.received("b.png", png(2))
+    assert panel.message.content == "One restyling at a time: wait for it, or stop it."
+    panel.stop.cb_hook(panel.stop)
+    go_on.set()
+    assert wait_for(panel) == "Stopped; the style on the screen stays."
+    assert len(panel.styles) == 1
+
+
+def test_restyling_gives_a_style_that_blends_and_a_run_that_renders(
+    panel: StylePanel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: List[str] = []
+    tell = panel._tell
+    monkeypatch.setattr(panel, "_tell", lambda progress: [tell(progress), seen.append(drawn(panel).sum().item())])
+    first = drawn(panel)
+    panel.upload.received("other painting.png", png(3))
+    said = wait_for(panel)
+    assert said.startswith("**other painting** is ready. Saved as a run of its own: ")
+    assert len(set(seen)) == 1  # the old style stays on the screen until the new one is ready
+    assert panel.style.value == "other painting" and panel.other.options == [NO_BLEND, "painting", "other painting"]
+    assert "other painting.png" in panel.description.content
+    second = drawn(panel)
+    assert (first - second).abs().max() > 0.1
+    assert not panel.blend.gui_handle.visible
+    panel.other.value, panel.blend.value = "painting", 1.0
+    assert torch.equal(drawn(panel), first)
+    panel.blend.value = 0.5
+    assert (drawn(panel) - first).abs().max() > 0.05 and (drawn(panel) - second).abs().max() > 0.05
+
+    saved = max(panel.folder.parent.glob("20*"))
+    assert str(saved) in said
+    _, pipeline, step = load_run(saved / "config.yml")
+    assert step == 2 and pipeline.config.style_image == saved / "style_image.png"
+    camera = pipeline.datamanager.train_dataset.cameras[:1]
+    with pipeline.model.rendering("baked"):
+        assert torch.equal(pipeline.model.get_outputs_for_camera(camera)["rgb"], second)
+    render(saved, tmp_path / "pictures")
+    assert len(list((tmp_path / "pictures").rglob("*.jpg"))) == 1
+
+
+def test_a_style_that_cant_be_saved_is_there_and_says_so(panel: StylePanel, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: Restyling) -> Path:
+        raise OSError("no room")
+
+    monkeypatch.setattr(Restyling, "save", full)
+    count = len(panel.styles)
+    panel.upload.received("other painting.png", png(3))
+    assert "**not saved**, no room," in wait_for(panel)
+    assert len(panel.styles) == count + 1
+    panel.styles.pop()
+    panel._offer_styles(panel.styles[0].name)
+
+
+def render(run: Path, output: Path) -> None:
+    from nerfstudio.scripts import render
+
+    flags = ["--camera-path-filename", str(write_camera_path(output)), "--output-format", "images"]
+    arguments = ["camera-path", "--load-config", str(run / "config.yml"), "--output-path", str(output), *flags]
+    run_entrypoint(render.entrypoint, arguments)
+
+
+def write_camera_path(folder: Path) -> Path:
+    """A path of one camera, in the form of the viewer's Render tab (another test makes one there)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    camera = {"camera_to_world": np.eye(4).flatten().tolist(), "fov": 50, "aspect": 1}
+    content = {
+        "camera_type": "perspective",
+        "render_height": 16,
+        "render_width": 16,
+        "camera_path": [camera],
+        "fps": 1,
+        "seconds": 1,
+        "smoothness_value": 0.5,
+        "is_cycle": False,
+        "crop": None,
+    }
+    path = folder / "path.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_restyling_takes_the_trainers_steps(runs: SimpleNamespace, painting: Path) -> None:
+    config = yaml.load((runs.style / "config.yml").read_text(), Loader=yaml.Loader)
+    coarse = torch.load(next((runs.coarse / "nerfstudio_models").iterdir()), weights_only=True)["pipeline"]
+    state = {name.removeprefix("_model."): value for name, value in coarse.items()}
+    training = Training(config, torch.device("cpu"), state)
+    pipeline = training.pipeline
+    fresh = pipeline.model.new_style()
+    pipeline.model.residual.load_state_dict(fresh.state_dict())
+    for _ in pipeline.warm_up(pipeline.task(), config.optimizers["fields"]["optimizer"].lr):
+        pass
+    for _ in range(3):
+        training.step()
+
+    workshop = Workshop(pipeline, runs.style, threading.Lock())
+    workshop.new_field = lambda: fresh
+    frozen = [view.frozen for view in pipeline.scene_views]
+    restyling = Restyling(workshop, StyleImage.read(painting), iterations=3)
+    steps = list(restyling)
+    assert [view.frozen for view in pipeline.scene_views] == frozen  # shared, not made again
+    assert steps[-1].done == 1.0 and steps[-1].seconds_left == 0.0
+    for name, value in pipeline.model.residual.state_dict().items():
+        assert torch.equal(restyling.field.state_dict()[name], value), name
+
+
+def test_random_numbers_of_training_go_on_as_if_there_were_no_restyling(panel: StylePanel) -> None:
+    torch.manual_seed(1)
+    expected = torch.rand(3)
+    torch.manual_seed(1)
+    fields = [panel._workshop.new_field() for _ in range(2)]
+    assert torch.equal(torch.rand(3), expected)
+    assert all(map(torch.equal, fields[0].parameters(), fields[1].parameters()))
+
+
+def test_names_are_told_apart() -> None:
+    assert [free_name("a", ["b"]), free_name("a", ["a"]), free_name("a", ["a", "a 2"])] == ["a", "a 2", "a 3"]
+
+
+def test_markdown_leaves_plain_text_alone() -> None:
+    assert plain("a_b*c`{d}<e>\nf/g-h.png") == r"a\_<wbr />b\*c\`\{d\}\<e\> f/<wbr />g-h.png"
