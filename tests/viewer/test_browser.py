@@ -17,7 +17,7 @@ import pytest
 from chromium import Tab, needs_chromium, open_tab
 from conftest import run_entrypoint
 
-WIDTH, HEIGHT = 900, 700
+WIDTH, HEIGHT = 760, 440  # small: a browser without a GPU draws it over and over
 SCRIPT = "from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"
 PATIENCE = 120
 """Seconds until something that doesn't happen counts as not happening; the first pictures compile kernels."""
@@ -99,7 +99,7 @@ class Page:
         return size is not None and max(map(int, size.groups())) in (256, 512)  # on a CPU, on a GPU
 
     def _pixels(self) -> np.ndarray:
-        return self.tab.screenshot()[80:620, 20:520].astype(float)
+        return self.tab.screenshot()[60:420, 10:430].astype(float)
 
 
 def difference(first: np.ndarray, second: np.ndarray) -> float:
@@ -152,8 +152,7 @@ def test_the_picture_arrives_and_sliders_change_it(page: Page) -> None:
     page.slide("Strength", "End")
     assert difference(page.scene(), stylised) < 2
     page.slide("Geometry", "Home")
-    painted = page.scene()
-    assert difference(painted, stylised) > 2 and difference(painted, coarse) > 2
+    assert difference(page.scene(), coarse) > 5  # the style's colours stay
     page.slide("Geometry", "End")
     assert difference(page.scene(), stylised) < 2
 
@@ -176,9 +175,8 @@ def test_the_split_shows_the_coarse_field_on_the_left(page: Page) -> None:
     page.slide("Strength", "Home")
     coarse = page.scene()
     assert difference(split, stylised) > 2 and difference(split, coarse) > 2
-    # Nothing but the right hand side depends on the strength; the divider is in the middle of the window.
-    left = slice(0, WIDTH // 2 - 40)
-    assert difference(split[:, left], coarse[:, left]) < 1
+    # Nothing but the right hand side depends on the strength; the divider is in the middle of the picture.
+    assert difference(split[:, :190], coarse[:, :190]) < 1 < difference(split[:, 230:], coarse[:, 230:])
     page.slide("Strength", "End")
     page.tab.evaluate("near('Coarse | stylised', 'input[type=checkbox]').click()")
     assert difference(page.scene(), stylised) < 2
