@@ -275,7 +275,7 @@ def test_samples_lie_in_occupied_cells(scene, rays, resolution, steps):
     assert (samples.lengths >= 0).all() and samples.positions.isfinite().all()
 
 
-@covers(volume.over_background, volume.seen_behind, volume.mean_position, volume.composite)
+@covers(volume.over_background, volume.seen_behind, volume.straight_color, volume.mean_position, volume.composite)
 @given(st.data(), COUNTS, st.integers(1, 50))
 def test_pixels_of_weights_are_mixtures(data, num_rays, samples):
     depth = data.draw(tensors((num_rays, samples), -30, 2, dtype=torch.float32)).clamp(max=80)
@@ -287,6 +287,12 @@ def test_pixels_of_weights_are_mixtures(data, num_rays, samples):
     assert (pixel >= -1e-6).all() and (pixel <= 1 + 1e-6).all()
     torch.testing.assert_close(pixel - volume.seen_behind(accumulation, background), 0.5 * accumulation.expand(-1, 3))
     assert (volume.seen_behind(accumulation, None) == 0).all()
+    half = accumulation.expand(-1, 3) * 0.5
+    for behind in (background, None):
+        own = volume.straight_color(volume.over_background(half, accumulation, behind), accumulation, behind)
+        assert (own >= 0).all() and (own <= 1).all()
+        shown = accumulation.expand(-1, 3) > 0.01
+        torch.testing.assert_close(own[shown], torch.full_like(own, 0.5)[shown], rtol=0, atol=1e-4)
     mean = volume.mean_position(weights, s)
     assert (mean >= 0).all() and (mean <= 1 + 1e-5).all()
     sums = torch.cat([accumulation.expand(-1, 3) * 0.5, accumulation, (weights * s).sum(dim=-1, keepdim=True)], dim=-1)
