@@ -35,6 +35,7 @@ from sparsestyle_ns.rendering.volume import (
     render_stylised,
     straight_color,
 )
+from sparsestyle_ns.undisturbed import undisturbed
 
 RAYS_PER_CALL = 1 << 13
 """Rays that are marched at once; bounds the memory of the steps in empty space."""
@@ -330,6 +331,7 @@ class HierStyleModel(Model):
         with autocast(self.device, self.config.precision):
             return render_mixed(self.field, styles, frozen, ray_bundle.directions, self.background, mix)
 
+    @undisturbed
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
         """`rgb` (stylised), `accumulation`, `depth` in world units, and the same of the coarse field as `…_coarse`."""
         segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
