@@ -110,7 +110,9 @@ def runs(llff_scene: Path, painting: Path, tmp_path_factory: pytest.TempPathFact
     """A coarse run of 3 iterations and a stylised run of 3 on it, both by ns-train: `.coarse`, `.style`, `.outputs`."""
     outputs = tmp_path_factory.mktemp("outputs")
     ns_train("coarse-fewshot", llff_scene, outputs, "--max-num-iterations", "3", *TINY)
+    # What so short a training leaves behind has no shape to be trusted, however it is measured.
     style = ["--style-image", str(painting), "--max-num-iterations", "3", *TINY_STYLE]
+    style += ["--pipeline.effects.residual-density", "on"]
     ns_train("hier-style", llff_scene, outputs, *style)
     return SimpleNamespace(
         outputs=outputs, coarse=only_run(outputs, "coarse-fewshot"), style=only_run(outputs, "hier-style")
