@@ -327,7 +327,8 @@ class StylePanel(ViewerControl):
                     self._let_pictures_pass()
             self._end(self._keep(restyling))
         except Exception as error:  # whatever it is, the viewer goes on
-            CONSOLE.print_exception()
+            if not isinstance(error, InputError):
+                CONSOLE.print_exception()
             self._end(f"**Not restyled.** {plain(_sentence(error))}")
         finally:
             self._busy.release()
