@@ -180,9 +180,10 @@ def _thumbnail(pixels: Pixels) -> Pixels:
 
 
 def _section(run: RunPictures, anchor: str) -> str:
+    name = escape(_full_name(run))
     return (
         f'<section class="run" id="{anchor}" aria-labelledby="{anchor}-name">\n'
-        f'<div class="heading"><h2 id="{anchor}-name">{escape(_full_name(run))}</h2><p>{escape(run.subtitle)}</p></div>\n'
+        f'<div class="heading"><h2 id="{anchor}-name">{name}</h2><p>{escape(run.subtitle)}</p></div>\n'
         f'<div class="stage">{_comparison(run.views[0])}{_film(run.film)}</div>\n'
         f"{_sources(run)}{_views(run.views)}{_facts(run)}</section>\n"
     )
