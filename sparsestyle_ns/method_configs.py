@@ -34,6 +34,7 @@ def _coarse_fewshot(draft: bool) -> TrainerConfig:
         steps_per_save=1000 if draft else 5000,
         steps_per_eval_batch=0,
         steps_per_eval_image=0,
+        preview_side=80 if draft else 256,
         steps_per_eval_all_images=0,
         pipeline=CoarseFewShotPipelineConfig(
             datamanager=FewShotDataManagerConfig(
@@ -63,6 +64,7 @@ def _hier_style(draft: bool) -> TrainerConfig:
         steps_per_save=50,
         steps_per_eval_batch=0,
         steps_per_eval_image=0,
+        preview_side=80 if draft else 256,
         steps_per_eval_all_images=0,
         pipeline=HierStylePipelineConfig(
             datamanager=FewShotDataManagerConfig(max_image_side=128 if draft else 1008),

@@ -17,8 +17,6 @@ from sparsestyle_ns.pipelines.base import CheckedPipeline
 
 FOLDER = "previews"
 """In a run's folder."""
-LONGEST_SIDE = 256
-"""Pixels of a preview's longer side, at most: large photos must not make it dear."""
 
 
 def preview_steps(shares: Sequence[float], total: int) -> FrozenSet[int]:
@@ -38,16 +36,20 @@ def preview_steps(shares: Sequence[float], total: int) -> FrozenSet[int]:
 
 
 @torch.no_grad()
-def render_preview(pipeline: CheckedPipeline) -> Float[Tensor, "H W 3"]:
+def render_preview(pipeline: CheckedPipeline, longest_side: int) -> Float[Tensor, "H W 3"]:
     """The middle one of the held-out views: photo, unstylised render where there is one, and render, side by side.
 
     Rendered exactly, and without leaving a trace in the state of training.
+
+    Args:
+        pipeline: of either method.
+        longest_side: pixels of the view's longer side, at most.
     """
     model, dataset = pipeline.model, pipeline.datamanager.eval_dataset
     index = len(dataset) // 2
     camera = dataset.cameras[index : index + 1].to(model.device)
     photo = dataset[index]["image"][..., :3].to(model.device)
-    scale = LONGEST_SIDE / max(photo.shape[:2])
+    scale = longest_side / max(photo.shape[:2])
     if scale < 1.0:
         camera.rescale_output_resolution(scale)
     size = int(camera.height), int(camera.width)

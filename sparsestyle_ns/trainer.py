@@ -70,9 +70,11 @@ class SparseStyleTrainerConfig(TrainerConfig):
     max_skipped_steps: int = 20
     """Iterations in a row, at least 1, whose gradient isn't finite and whose step is therefore skipped, after which
     training stops."""
-    previews: Tuple[float, ...] = (0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
+    previews: Tuple[float, ...] = (0.1, 0.25, 0.5, 1.0)
     """Shares of the iterations, in (0, 1], after which a held-out view is rendered, into the folder previews of the run
     and into tensorboard where it is on; none: --previews alone."""
+    preview_side: int = 256
+    """Longer side of a preview in pixels, at most; its time grows with the square."""
 
     @exit_on_input_error
     def save_config(self) -> None:
@@ -273,7 +275,7 @@ class SparseStyleTrainer(Trainer):
 
     @check_main_thread
     def _write_preview(self, iterations: int) -> None:
-        picture = render_preview(self.pipeline)
+        picture = render_preview(self.pipeline, self.config.preview_side)
         writer.put_image(name="Preview", image=picture, step=iterations)
         try:
             save_preview(picture, self.base_dir, iterations)

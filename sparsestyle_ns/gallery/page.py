@@ -138,7 +138,7 @@ def _contents(runs: Sequence[RunPictures]) -> str:
 
 
 def _full_name(run: RunPictures) -> str:
-    return f"{run.name}, {run.style_name}" if run.style_name else run.name
+    return f"{run.name} · {run.style_name}" if run.style_name else run.name
 
 
 def _grid(runs: Sequence[RunPictures]) -> str:
@@ -180,9 +180,10 @@ def _thumbnail(pixels: Pixels) -> Pixels:
 
 
 def _section(run: RunPictures, anchor: str) -> str:
+    name = escape(_full_name(run))
     return (
         f'<section class="run" id="{anchor}" aria-labelledby="{anchor}-name">\n'
-        f'<div class="heading"><h2 id="{anchor}-name">{escape(run.name)}</h2><p>{escape(run.subtitle)}</p></div>\n'
+        f'<div class="heading"><h2 id="{anchor}-name">{name}</h2><p>{escape(run.subtitle)}</p></div>\n'
         f'<div class="stage">{_comparison(run.views[0])}{_film(run.film)}</div>\n'
         f"{_sources(run)}{_views(run.views)}{_facts(run)}</section>\n"
     )

@@ -5,6 +5,7 @@ import pytest
 from chromium import needs_chromium, open_tab
 from test_gallery_page import make_pixels, make_run
 
+from sparsestyle_ns.evaluation.tables import Table
 from sparsestyle_ns.gallery.film import encode_mp4
 from sparsestyle_ns.gallery.page import Film, View, gallery_page
 
@@ -21,9 +22,13 @@ def plain(color, height=60, width=80):
 def tab(tmp_path_factory):
     folder = tmp_path_factory.mktemp("browser")
     turning = [np.roll(make_pixels(3, 48, 64), 4 * step, axis=1) for step in range(8)]
+    wide = Table("Consistency", ["a rather long heading of a column"] * 9, [("stylised", ["0.1234"] * 9)])
+    effects = [("effect", "why"), ("ndc", "the cameras look one way, and depth has no end " * 3)]
     run = make_run(
         views=[View("held-out view 0", plain(RED), plain(BLUE), plain((9, 9, 9)))],
         film=Film(encode_mp4(turning), "A turn"),
+        tables=[wide],
+        effects=effects,
     )
     path = folder / "gallery.html"
     path.write_text(gallery_page([run, make_run(name="flower")], "Two scenes"), encoding="utf-8")
@@ -101,6 +106,15 @@ def test_the_film_plays(tab):
     assert tab.evaluate("document.querySelector('video').duration") == pytest.approx(0.5, abs=0.1)
     before = tab.evaluate("document.querySelector('video').currentTime")
     tab.wait_for(f"document.querySelector('video').currentTime !== {before}")
+
+
+def test_a_narrow_screen_never_scrolls_sideways(tab):
+    narrow = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+    tab.call("Emulation.setDeviceMetricsOverride", **narrow)
+    try:
+        assert tab.evaluate("document.documentElement.scrollWidth") <= 400
+    finally:
+        tab.call("Emulation.setDeviceMetricsOverride", **{**narrow, "width": WIDTH, "height": 700})
 
 
 def test_the_grid_leads_to_the_runs(tab):
