@@ -1,6 +1,7 @@
 """`hier-style`: the coarse field, frozen, and the residual field that stylises it (stage 2)."""
 
 import contextlib
+import threading
 from dataclasses import dataclass, field, replace
 from typing import Any, Callable, Dict, Iterator, List, Literal, Optional, Tuple, Type
 
@@ -146,6 +147,7 @@ class HierStyleModel(Model):
         self.look = Look(config.render_mode, self._configured_mix())
         self.viewer_look: Callable[[], Optional[Look]] = lambda: None
         self._baked: Dict[nn.Module, Tuple[BakedVolume, List[Tensor]]] = {}
+        self._baking = threading.Lock()  # volumes grow while they are rendered, and a viewer has several threads
 
     def _configured_mix(self) -> Mix:
         config = self.config
@@ -317,8 +319,9 @@ class HierStyleModel(Model):
     def _render_baked(self, segments: Segments, styles: Tuple[nn.Module, ...], mix: Mix) -> Tuple[PackedRender, ...]:
         config = self.config
         rays = Rays(segments, self.occupancy, config.num_steps, self.space.unbounded, config.min_transmittance)
-        first, second = (*map(self._current_volume, styles), None)[:2]
-        return render_baked(first, rays, self.background, mix, second)
+        with self._baking:
+            first, second = (*map(self._current_volume, styles), None)[:2]
+            return render_baked(first, rays, self.background, mix, second)
 
     def fill_baked(
         self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], style: nn.Module

@@ -24,7 +24,7 @@ PATIENCE = 120
 
 HELPERS = """
 window.leaf = text => [...document.querySelectorAll('label, div, p, span, button')]
-  .filter(e => e.innerText && e.innerText.trim() === text).pop();
+  .filter(e => e.checkVisibility() && e.innerText.trim() === text).pop();
 window.near = (text, selector) => {
   for (let e = leaf(text); e; e = e.parentElement) {
     const found = e.querySelector(selector);
@@ -33,7 +33,7 @@ window.near = (text, selector) => {
 };
 0
 """
-"""Finds the innermost element that says something, and the control beside it."""
+"""Finds the innermost visible element that says something (hidden tabs say the same), and the control beside it."""
 
 
 class Page:
@@ -224,9 +224,7 @@ def test_a_camera_path_made_in_the_viewer_renders(
         time.sleep(1.0)
     page.click("Generate Command")
     page.wait_for("document.body.innerText.includes('ns-render camera-path')")
-    words = page.tab.evaluate(
-        "[...document.querySelectorAll('code')].map(e => e.innerText).find(t => t.includes('ns-render'))"
-    )
+    words = page.tab.evaluate("document.body.innerText.match(/ns-render camera-path.*/)[0]")
     arguments = words.split()
     assert arguments[:2] == ["ns-render", "camera-path"]
     output = arguments.index("--output-path") + 1

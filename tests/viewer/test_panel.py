@@ -116,6 +116,22 @@ def test_without_a_gpu_the_viewer_begins_with_baked_pictures(panel: StylePanel) 
     assert panel.pipeline.model.residual in panel.pipeline.model._baked
 
 
+def test_several_threads_may_fill_one_volume_at_a_time(panel: StylePanel) -> None:
+    model = panel.pipeline.model
+    cameras = panel.pipeline.datamanager.train_dataset.cameras
+    alone = [drawn(panel)]
+    model._baked.clear()
+    threads = [
+        Drawing(lambda camera=camera: model.get_outputs_for_camera(camera)["rgb"])
+        for camera in (cameras[:1], cameras[1:2], cameras[2:3]) * 2
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert torch.equal(threads[0].result, alone[0]) and torch.equal(threads[3].result, alone[0])
+
+
 def test_volumes_are_filled_ahead_for_the_photos_cameras_and_those_between(
     panel: StylePanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
