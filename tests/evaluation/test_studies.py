@@ -217,7 +217,7 @@ def test_ablate_runs_every_ablation_and_shows_traces_and_pictures_on_the_way(
 ) -> None:
     main(arguments("ablate", llff_scene, painting, tmp_path, 22))
     names = [name for name, _ in train_here]
-    assert len(set(names)) == 3 + 11
+    assert len(set(names)) == 4 + 14
     assert names.count(f"ours-ours-{painting.stem}") == 2  # up to its stop, and on
     page = (tmp_path / "ablate.html").read_text()
     assert all(heading.split(" (")[0] in page for heading in GROUPS)
