@@ -123,12 +123,6 @@ def held_out_psnr(
         ("blender", (), {"background": "on"}, {"background": "off"}),
         ("llff", ("--num-views", "48", "--shiny", "0.8"), {"view_color": "on"}, {"view_color": "off"}),
         ("llff", ("--exposure", "0.7"), {"exposure": "on"}, {"exposure": "off"}),
-        (
-            "nerfstudio",
-            ("--num-views", "48", "--distortion", "0.4"),
-            {"lens_distortion": "on"},
-            {"lens_distortion": "off"},
-        ),
         ("blender", (), {"empty_space": "on"}, {"empty_space": "off"}),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else None,
