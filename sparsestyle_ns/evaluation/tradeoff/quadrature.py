@@ -128,7 +128,12 @@ class Quadrature:
         self._alphas: Dict[float, Occupancy] = {}
 
     def plans(self) -> List[Plan]:
-        """Samples of the coarse field; steps, skipping and stopping of the fields together."""
+        """Samples of the coarse field; steps, skipping and stopping of stage 2's renders.
+
+        The latter are looked at in the coarse picture that comes with each stylised one, by the same samples: what the
+        residual field says of empty cells, which training never visits, means nothing, and a render that skips
+        nothing would show it.
+        """
         coarse, style = self.study.coarse_config.pipeline.model, self.study.style_config.pipeline.model
 
         def plan(name: str, title: str, setting: str, preset: float, measure: Measure) -> Plan:
@@ -179,7 +184,7 @@ class Quadrature:
 
             def render(bundle: RayBundle, steps: int) -> Tensor:
                 with settings(model.config, num_steps=steps):
-                    return model.get_outputs(bundle)[self.study.picture]
+                    return model.get_outputs(bundle)["rgb_coarse"]
 
             def converged(bundle: RayBundle, steps: int) -> Tensor:
                 occupancy, model.occupancy = model.occupancy, Occupancy(1).to(self.study.device)
