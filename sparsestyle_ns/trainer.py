@@ -3,6 +3,7 @@
 import copy
 import signal
 import warnings
+from abc import ABC, abstractmethod
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -95,7 +96,7 @@ warnings.filterwarnings("ignore", message="Using a non-tuple sequence", module="
 warnings.filterwarnings("ignore", message="Sparse invariant checks are implicitly disabled")
 
 
-class SparseStyleTrainer(Trainer):
+class SparseStyleTrainer(Trainer, ABC):
     """The trainer of both methods."""
 
     config: SparseStyleTrainerConfig
@@ -290,9 +291,9 @@ class SparseStyleTrainer(Trainer):
         else:
             finish(self.base_dir, self.next_command())
 
+    @abstractmethod
     def next_command(self) -> List[str]:
         """A command that uses the finished run."""
-        raise NotImplementedError
 
     def notes(self) -> Dict[str, Any]:
         """What a checkpoint says beside the state: numbers and words only."""
