@@ -22,10 +22,9 @@ pytestmark = [
 
 
 def run(*command: str) -> None:
-    """Runs a console script of this environment as a process of its own, with the threads torch finds best."""
-    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    """Runs a console script of this environment as a process of its own."""
     script = Path(sys.executable).with_name(command[0])
-    ended = subprocess.run([script, *map(str, command[1:])], env=environment, capture_output=True, text=True)
+    ended = subprocess.run([script, *map(str, command[1:])], capture_output=True, text=True)
     assert ended.returncode == 0, ended.stdout[-2000:] + ended.stderr[-4000:]
 
 

@@ -6,7 +6,9 @@ from typing import List, Sequence
 
 import matplotlib
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis as Scale
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from sparsestyle_ns.evaluation.tradeoff.axis import METRICS, Axis, Point
 
@@ -69,11 +71,19 @@ def draw(cell: Axes, axis: Axis, x: str, y: str) -> None:
         cell.plot(chosen.median(x), height(chosen), "o", ms=13, mfc="none", mec=CHOSEN, mew=1.8, zorder=4)
     cell.set_xlabel(METRICS[x].label)
     cell.set_ylabel(METRICS[y].label)
-    for metric, scale in ((x, cell.set_xscale), (y, cell.set_yscale)):
+    for metric, scale in ((x, cell.xaxis), (y, cell.yaxis)):
         if METRICS[metric].log and all(point.median(metric) > 0 for point in points):
-            scale("log")
+            _make_logarithmic(scale)
     cell.grid(True, which="major", color="#e4e1da", lw=0.6)
     cell.margins(0.12)
+
+
+def _make_logarithmic(scale: Scale) -> None:
+    """Labels 1, 2, 5, 10, …: with a label at each minor tick those of less than a decade run into each other."""
+    scale.axes.set(**{f"{scale.axis_name}scale": "log"})
+    scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    scale.set_major_formatter(StrMethodFormatter("{x:g}"))
+    scale.set_minor_formatter(NullFormatter())
 
 
 def _draw_points(cell: Axes, points: Sequence[Point], x: str, height: object, y: str) -> None:
