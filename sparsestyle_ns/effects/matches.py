@@ -21,6 +21,8 @@ MAX_EPIPOLAR_ERROR = 1.0
 """Sampson distance, in pixels, up to which a match obeys the cameras."""
 BLUR = 2.0
 """Standard deviation, in pixels, of the blur under which colours are taken."""
+UNTIL_EXACT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+"""When OpenCV has inverted a lens; its usual five steps leave an error."""
 NEAREST_VIEWS = 6
 """Photos that each photo is matched with: those whose cameras look most nearly the same way."""
 
@@ -158,7 +160,8 @@ def undistorted(points: Float[np.ndarray, "points 2"], cameras: Cameras, index: 
     if cameras.distortion_params is None:
         return points
     k1, k2, k3, _, p1, p2 = cameras.distortion_params[index].double().tolist()
-    return cv2.undistortPoints(points[:, None], np.eye(3), np.array([k1, k2, p1, p2, k3]))[:, 0]
+    lens = np.array([k1, k2, p1, p2, k3])
+    return cv2.undistortPointsIter(points[:, None], np.eye(3), lens, np.eye(3), np.eye(3), UNTIL_EXACT)[:, 0]
 
 
 def mutual_matches(

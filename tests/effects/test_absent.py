@@ -3,6 +3,7 @@
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from conftest import decided
@@ -164,6 +165,26 @@ def test_without_lens_distortion_no_ray_is_undistorted(tmp_path: Path):
     bent, off = operations("bent", "on"), operations("bent", "off")
     assert off == operations("straight", "off")
     assert off.total() < bent.total()
+
+
+def test_rays_of_a_bent_lens_are_those_that_the_photos_show(tmp_path: Path):
+    import make_sample_scene
+
+    k1, width, height = 0.4, 40, 30
+    options = ["--layout", "nerfstudio", "--num-views", "9", "--supersample", "1", "--distortion", str(k1)]
+    make_sample_scene.main([str(tmp_path), "--width", str(width), *options])
+    rows = np.arange(height)
+    # The script renders along these rays; on a camera that looks along −z, a ray's place in the picture is x/−z, y/−z.
+    config = FewShotDataManagerConfig(data=tmp_path / "nerfstudio", dataparser=NerfstudioDataParserConfig())
+    for choice, largest, smallest in (("on", 1e-3, 0.0), ("off", 4.0, 2.0)):
+        config.effects = EffectSettings(lens_distortion=choice)
+        cameras = config.setup(device="cpu", test_mode="inference").train_dataset.cameras
+        focal = float(cameras.fx[0])
+        true, _ = make_sample_scene._band_of_rays(np.eye(3, 4), focal, height, width, rows, 1, k1)
+        rays = cameras.generate_rays(camera_indices=0, keep_shape=True)
+        local = (rays.directions @ cameras.camera_to_worlds[0, :, :3]).reshape(-1, 3).numpy()
+        errors = focal * np.linalg.norm(local[:, :2] / local[:, 2:] - true[:2].T / true[2:].T, axis=-1)
+        assert smallest <= errors.max() < largest
 
 
 def test_without_matched_depth_no_ray_is_trained_on_that_has_no_colour(tmp_path: Path):
