@@ -7,6 +7,7 @@ A small ray tracer draws balls, boxes and columns with painted surfaces, in the 
     python data_scripts/make_sample_scene.py OUTPUT --layout blender --num-train 40
     python data_scripts/make_sample_scene.py OUTPUT --layout nerfstudio --distortion 0.1
     python data_scripts/make_sample_scene.py OUTPUT --layout llff --shiny 0.6 --exposure 0.5
+    python data_scripts/make_sample_scene.py OUTPUT --layout llff --haze 0.3
 
 `OUTPUT/llff` holds `images/image000.png`, ... and `poses_bounds.npy`: forward-facing photos of a still life in a room.
 `OUTPUT/blender` holds `train`, `val` and `test` folders of RGBA pictures and `transforms_*.json`: objects on a plinth
@@ -501,14 +502,18 @@ class Scene:
     """Direction towards that lamp, which does nothing else; any length."""
     polish: float = 40.0
     """Exponent of that reflection: how narrow it is."""
+    haze: float = 0.0
+    """Extinction a scene unit of the mist that fills the scene: what is d away shows exp(−haze d) of its colour."""
+    haze_color: tuple[float, float, float] = (0.75, 0.78, 0.82)
+    """What the mist shows instead."""
 
 
-def still_life(seed: int = 0, shine: float = 0.0) -> Scene:
+def still_life(seed: int = 0, shine: float = 0.0, haze: float = 0.0) -> Scene:
     """The forward-facing scene: toys in front of a wall, z up, to be seen from around (0, 0, 1.25) along +y.
 
     Args:
         seed: Which noise the textures show; the shapes stay where they are.
-        shine: See `Scene`.
+        shine, haze: See `Scene`.
     """
     crate_half, cube_half, picture_half = (0.52, 0.52, 0.52), (0.3, 0.3, 0.3), (0.95, 0.05, 0.68)
     backdrop = (
@@ -531,7 +536,7 @@ def still_life(seed: int = 0, shine: float = 0.0) -> Scene:
         Cylinder((1.12, 2.5, 0.17), 0.26, 0.17, lambda p, n: drum(p, n, 0.17)),
     )
     sun, lamp = (-0.62, -0.75, 1.0), (-0.1, -1.0, 0.1)
-    return Scene(shapes, ValueNoise(seed), sun=sun, backdrop=backdrop, shine=shine, lamp=lamp)
+    return Scene(shapes, ValueNoise(seed), sun=sun, backdrop=backdrop, shine=shine, lamp=lamp, haze=haze)
 
 
 def objects_on_a_plinth(seed: int = 0, shine: float = 0.0, landscape: bool = False) -> Scene:
@@ -689,6 +694,9 @@ def _trace(scene: Scene, origin: np.ndarray, directions: np.ndarray, samples: in
     if scene.shine > 0:
         shaded += _gloss(scene, normals, directions[:, hits])
     colours[:, hits] = np.clip(shaded, 0, 1)
+    if scene.haze > 0:
+        clear = np.exp(np.float32(-scene.haze) * nearest)
+        colours = clear * colours + (1 - clear) * np.array(scene.haze_color, np.float32)[:, None]
     return colours, nearest
 
 
@@ -863,6 +871,7 @@ def write_llff(
     seed: int = 0,
     exposure: float = 0.0,
     shine: float = 0.0,
+    haze: float = 0.0,
 ) -> None:
     """Writes `images/image000.png`, ... and `poses_bounds.npy` of `still_life` into `folder`.
 
@@ -874,11 +883,11 @@ def write_llff(
         supersample: Rays along each side of a pixel.
         seed: Which noise and which jitter of the cameras.
         exposure: Stops by which photos differ; see `photo_gains`. Every eighth, which is held out, has a gain of 1.
-        shine: See `Scene`.
+        shine, haze: See `Scene`.
     """
     height = round(width * 0.75) if height is None else height
     focal = LLFF_FOCAL_PER_WIDTH * width
-    scene = still_life(seed, shine)
+    scene = still_life(seed, shine, haze)
     held_out = [i for i in range(num_views) if i % 8 == 0 and num_views > 8]
     gains = photo_gains(num_views, exposure, held_out, seed)
     (folder / "images").mkdir()
@@ -1050,6 +1059,7 @@ def _parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:
     parser.add_argument("--supersample", type=int, default=3, help="rays along each side of a pixel; odd")
     parser.add_argument("--exposure", type=float, default=0.0, help="stops by which training pictures differ")
     parser.add_argument("--shiny", type=float, default=0.0, help="brightness of a lamp's reflection, 0 to 1")
+    parser.add_argument("--haze", type=float, default=0.0, help="llff: extinction of a mist a scene unit, 0 to 10")
     parser.add_argument("--distortion", type=float, default=0.0, help="nerfstudio: k1 of the lens, -0.2 to 0.5")
     parser.add_argument("--seed", type=int, default=0, help="which textures and cameras")
     parser.add_argument("--force", action="store_true", help="replace what OUTPUT holds already")
@@ -1061,9 +1071,14 @@ def _parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:
             parser.error(f"--{name.replace('_', '-')} is {value}, but has to be at least {least}")
     if options.supersample % 2 == 0:
         parser.error(f"--supersample is {options.supersample}, but has to be odd")
-    for name, low, high in (("exposure", 0.0, 3.0), ("shiny", 0.0, 1.0), ("distortion", -0.2, 0.5)):
+    for name, low, high in (
+        *(("exposure", 0.0, 3.0), ("shiny", 0.0, 1.0)),
+        *(("haze", 0.0, 10.0), ("distortion", -0.2, 0.5)),
+    ):
         if not low <= getattr(options, name) <= high:
             parser.error(f"--{name} is {getattr(options, name)}, but has to be between {low} and {high}")
+    if options.haze != 0 and options.layout != "llff":
+        parser.error("--haze needs --layout llff: in a mist the objects of the other layouts have no outline")
     if options.distortion != 0 and options.layout != "nerfstudio":
         parser.error("--distortion needs --layout nerfstudio: the other layouts have no place for it")
     if options.seed < 0:
@@ -1082,7 +1097,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
             _write_layout(
                 options.output / "llff",
                 options.force,
-                lambda folder: write_llff(folder, options.num_views, **size, **common),
+                lambda folder: write_llff(folder, options.num_views, **size, **common, haze=options.haze),
             )
         if options.layout in ("blender", "both"):
             counts = (options.num_train, options.num_val, options.num_test)

@@ -1,7 +1,7 @@
 """The density that stage 2 adds to the coarse one (Eq. 3)."""
 
 from sparsestyle_ns.effects.base import Effect, Measurement
-from sparsestyle_ns.effects.empty_space import MIN_ALPHA, opacities
+from sparsestyle_ns.effects.empty_space import opacities
 from sparsestyle_ns.effects.scene import Scene
 
 MAX_ALPHA = 0.5
@@ -21,6 +21,6 @@ class ResidualDensity(Effect):
         """See `Effect.measure`; the share of the space that isn't empty in which there is haze, not a surface."""
         if scene.coarse_density is None:
             return Measurement(True, "assumed until there is a coarse field to measure", None, MIN_HAZE)
-        alpha = opacities(scene)
-        haze = float((alpha[alpha >= MIN_ALPHA] < MAX_ALPHA).float().mean()) if (alpha >= MIN_ALPHA).any() else 0.0
+        alpha, empty = opacities(scene)
+        haze = 0.0 if empty.all() else float((alpha[~empty] < MAX_ALPHA).float().mean())
         return Measurement(haze >= MIN_HAZE, "of what isn't empty is haze, neither surface nor solid", haze, MIN_HAZE)

@@ -392,3 +392,20 @@ def test_distortion_is_refused_where_the_layout_has_no_place_for_it(tmp_path):
         main([str(tmp_path), "--layout", "llff", "--distortion", "0.1"])
     with pytest.raises(SystemExit):
         main([str(tmp_path), "--layout", "llff", "--shiny", "2"])
+
+
+def test_mist_takes_light_by_the_length_of_its_way(two_views):
+    pose, _, _ = two_views[0]
+    # One ray a pixel: a pixel's way is its depth over the cosine with the viewing axis.
+    clear, _, depth = render_sample(pose, FOCAL, HEIGHT, WIDTH, supersample=1)
+    scene = still_life(haze=0.3)
+    hazy, _, _ = render_sample(pose, FOCAL, HEIGHT, WIDTH, scene, supersample=1)
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+    way = depth * np.sqrt(1 + ((x - WIDTH / 2) ** 2 + (y - HEIGHT / 2) ** 2) / FOCAL**2)
+    seen = np.exp(-0.3 * way)[..., None]
+    np.testing.assert_allclose(hazy, seen * clear + (1 - seen) * np.array(scene.haze_color), atol=1e-5)
+
+
+def test_mist_is_refused_where_objects_have_an_outline(tmp_path):
+    with pytest.raises(SystemExit):
+        main([str(tmp_path), "--layout", "blender", "--haze", "0.3"])

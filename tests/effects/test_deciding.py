@@ -146,7 +146,14 @@ def haze(points):
     return torch.where(points.norm(dim=-1) < 0.6, 10.0, 0.0)
 
 
-@pytest.mark.parametrize("density, skips, hazy", [(fog(5.0), False, True), (ball, True, False), (haze, True, True)])
+THIN = fog(0.9)
+"""Each cell lets 97% of the light through, the whole cube 16%."""
+
+
+@pytest.mark.parametrize(
+    "density, skips, hazy",
+    [(fog(5.0), False, True), (THIN, False, True), (fog(0.05), True, False), (ball, True, False), (haze, True, True)],
+)
 def test_the_coarse_field_decides_about_empty_space_and_residual_density(made, density, skips, hazy):
     scene = dataclasses.replace(made("blender", *OBJECT), coarse_density=density)
     decisions = decide(scene, ALL_AUTO)

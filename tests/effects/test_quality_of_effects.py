@@ -2,6 +2,7 @@
 
 import copy
 import functools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Dict, List, Optional, Tuple
 
@@ -12,7 +13,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from torch import Tensor
 
 from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
-from sparsestyle_ns.effects.registry import EffectSettings
+from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings, decide
 from sparsestyle_ns.evaluation.held_out import evaluate_held_out
 from sparsestyle_ns.evaluation.image_metrics import psnr
 from sparsestyle_ns.evaluation.training import Training
@@ -131,6 +132,17 @@ def test_an_effect_that_a_scene_calls_for_makes_held_out_views_better(scenes, la
     folder = scenes(layout, *options)
     with_it, without = (held_out_psnr(folder, layout, 300, effects) for effects in (on, off))
     assert with_it > without
+
+
+@pytest.mark.parametrize("options, is_on", [((), True), (("--haze", "1"), False)], ids=["clear", "thick mist"])
+def test_the_coarse_field_of_a_made_scene_calls_for_skipping_and_residual_density_or_not(scenes, options, is_on):
+    pipeline = trained_coarse(scenes("llff", *options), "llff", 300, {})
+    # In a thick mist all photos are grey: what is learned is solid all over, nothing to skip and nothing doubtful.
+    field = pipeline.model.field
+    scene = replace(pipeline.datamanager.scene, coarse_density=lambda points: field.density_and_feature(points)[0])
+    decisions = decide(scene, ALL_AUTO)
+    assert decisions.on("empty_space") is decisions.on("residual_density") is is_on
+    assert decisions["empty_space"].measured is not None
 
 
 @pytest.mark.slow
