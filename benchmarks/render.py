@@ -22,9 +22,9 @@ from benchmarks._scene import (
     style_config,
 )
 from sparsestyle_ns.errors import exit_on_input_error
-from sparsestyle_ns.evaluation.held_out import rendered
 from sparsestyle_ns.evaluation.image_metrics import psnr
 from sparsestyle_ns.evaluation.training import Training
+from sparsestyle_ns.models.hier_style import RenderMode
 
 SIDE = 252
 FRAMES_BETWEEN_VIEWS = 10
@@ -71,8 +71,12 @@ def main(options: RenderOptions) -> None:
 
         return timed(work, report.device, prepare)
 
-    exact = contender("exact", lambda camera: rendered(model, camera, "exact")["rgb"])
-    baked = contender("baked", lambda camera: rendered(model, camera, "baked")["rgb"])
+    def picture(camera: Cameras, mode: RenderMode) -> Tensor:
+        with model.rendering(mode):
+            return model.get_outputs_for_camera(camera)["rgb"]
+
+    exact = contender("exact", lambda camera: picture(camera, "exact"))
+    baked = contender("baked", lambda camera: picture(camera, "baked"))
     slow = contender("plain", plain.picture)
 
     first = baked(-2).seconds

@@ -1,3 +1,4 @@
+import importlib
 import json
 import subprocess
 import sys
@@ -317,6 +318,11 @@ def test_effects_are_timed_with_and_without_each_other(tmp_path, monkeypatch):
     assert all(row["with_over_without"] > 0 for row in content["rows"])
     with pytest.raises(SystemExit, match="shadow"):
         effects.main(effects.EffectOptions(device="cpu", output_dir=tmp_path, only=("shadow",)))
+
+
+@pytest.mark.parametrize("path", sorted(Path(_measure.__file__).parent.glob("[a-z]*.py")), ids=lambda path: path.stem)
+def test_every_benchmark_finds_what_it_measures(path):
+    assert callable(importlib.import_module(f"benchmarks.{path.stem}").main)
 
 
 def test_a_benchmark_can_be_run_as_a_command(tmp_path):

@@ -6,7 +6,7 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, ImageOps
+from PIL import Image
 
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.held_out import SavedReport, evaluate_held_out, exact_outputs, saved_report
@@ -14,8 +14,10 @@ from sparsestyle_ns.evaluation.tables import report_tables
 from sparsestyle_ns.gallery.film import as_pixels, make_film
 from sparsestyle_ns.gallery.page import Picture, RunPictures, View, read_film
 from sparsestyle_ns.page import Pixels
+from sparsestyle_ns.photos import PhotoDataset
 from sparsestyle_ns.progress import track
 from sparsestyle_ns.run_folder import REPORT_FILE, STYLE_METHOD, find_config, load_run
+from sparsestyle_ns.style.image import load_style_image
 from sparsestyle_ns.view_selection import evenly_spaced
 
 LONGEST_SIDE = 512
@@ -44,10 +46,8 @@ def collect_run(
         raise InputError(f"--num-views is {num_views}; at least one view is needed.")
     config, pipeline, step = load_run(config_path)
     dataset, held_out = pipeline.datamanager.train_dataset, pipeline.datamanager.eval_dataset
-    photos = [
-        Picture(_photo(dataset, index), path.name)
-        for index, path in enumerate(dataset._dataparser_outputs.image_filenames)
-    ]
+    originals = _at_full_size(dataset)
+    photos = [Picture(_photo(originals, index), path.name) for index, path in enumerate(originals.image_filenames)]
     views, measured = _render_views(pipeline, held_out, num_views)
     if film is None and frames > 0:
         film = make_film(pipeline.model, dataset.cameras, frames, LONGEST_SIDE)
@@ -73,13 +73,14 @@ def collect_run(
     )
 
 
-def _render_views(pipeline: Any, dataset: Any, num_views: int) -> Tuple[List[View], List[Dict[str, float]]]:
+def _render_views(pipeline: Any, dataset: PhotoDataset, num_views: int) -> Tuple[List[View], List[Dict[str, float]]]:
     """Held-out views with their photos, and what the model measures of each."""
-    trained = set(pipeline.datamanager.train_dataset._dataparser_outputs.image_filenames)
+    trained = set(pipeline.datamanager.train_dataset.image_filenames)
+    originals = _at_full_size(dataset)
     views, measured = [], []
     for index in track(evenly_spaced(len(dataset), min(num_views, len(dataset))), "Views"):
-        path = dataset._dataparser_outputs.image_filenames[index]
-        photo = _photo(dataset, index)
+        path = dataset.image_filenames[index]
+        photo = _photo(originals, index)
         height, width = photo.shape[:2]
         camera = dataset.cameras[index : index + 1].to(pipeline.device)
         camera.rescale_output_resolution(width / camera.width.item())
@@ -119,14 +120,14 @@ def depth_picture(depth: Float[np.ndarray, "H W 1"], accumulation: Float[np.ndar
     return as_pixels(shade * weight + 0.5 * (1.0 - weight))
 
 
-def _photo(dataset: Any, index: int) -> Pixels:
-    """A photo of a dataset at the size of its file, where the run was trained on a smaller one; at most 512 pixels."""
-    scale, dataset.scale_factor = dataset.scale_factor, 1.0
-    try:
-        pixels = dataset.get_image_uint8(index)[..., :3].numpy()
-    finally:
-        dataset.scale_factor = scale
-    return _fitted(Image.fromarray(pixels))
+def _at_full_size(dataset: PhotoDataset) -> PhotoDataset:
+    """The same photos at the size of their files, where the run was trained on smaller ones."""
+    return PhotoDataset(dataset._dataparser_outputs)
+
+
+def _photo(dataset: PhotoDataset, index: int) -> Pixels:
+    """A photo of a dataset, at most 512 pixels along its longer side."""
+    return _fitted(Image.fromarray(dataset.get_image_uint8(index)[..., :3].numpy()))
 
 
 def _fitted(image: Image.Image) -> Pixels:
@@ -138,10 +139,10 @@ def _style_picture(path: Optional[Path]) -> Optional[Picture]:
     if path is None:
         return None
     try:
-        with Image.open(path) as image:
-            return Picture(_fitted(ImageOps.exif_transpose(image).convert("RGB")), path.name)
-    except OSError:  # also what Pillow raises for what isn't a picture
+        image = load_style_image(path)
+    except InputError:
         return None
+    return Picture(_fitted(Image.fromarray(as_pixels(image.permute(1, 2, 0).numpy()))), path.name)
 
 
 FIGURE_LABELS = {

@@ -8,7 +8,9 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+import yaml
 from nerfstudio.cameras.cameras import Cameras
+from PIL import Image
 
 from sparsestyle_ns.coarse_run import newest_checkpoint
 from sparsestyle_ns.errors import InputError
@@ -65,6 +67,30 @@ def test_collect_run_shows_photos_and_held_out_views_wherever_the_run_is_now(run
     assert frames_of(run.film.content).shape == (3, 24, 32, 3)
     assert "flight" in run.film.caption
     assert "<video" in gallery_page([run], "A run")
+
+
+def test_a_run_on_reduced_photos_is_shown_with_the_photos_as_they_are(runs, tmp_path):
+    moved = tmp_path / "outputs" / "scene" / "hier-style" / "run"
+    shutil.copytree(runs.style, moved)
+    config = (moved / "config.yml").read_text()
+    assert "max_image_side: 1008" in config
+    (moved / "config.yml").write_text(config.replace("max_image_side: 1008", "max_image_side: 16"))
+    run = collect_run(moved, num_views=1, frames=0)
+    assert dict(run.settings)["Photo size in training"] == "16 × 12 pixels"
+    pictures = [photo.pixels for photo in run.photos]
+    pictures += [getattr(run.views[0], name) for name in ("photo", "coarse", "stylised")]
+    assert {pixels.shape for pixels in pictures} == {(24, 32, 3)}
+
+
+def test_a_painting_is_shown_as_it_was_read(runs, tmp_path):
+    """Transparent pixels over white, as in training."""
+    moved = tmp_path / "outputs" / "scene" / "hier-style" / "run"
+    shutil.copytree(runs.style, moved)
+    Image.new("RGBA", (16, 8), (255, 0, 0, 0)).save(tmp_path / "clear.png")
+    config = yaml.load((moved / "config.yml").read_text(), Loader=yaml.Loader)
+    config.pipeline.style_image = tmp_path / "clear.png"
+    (moved / "config.yml").write_text(yaml.dump(config))
+    np.testing.assert_array_equal(collect_run(moved, num_views=1, frames=0).style.pixels, np.full((8, 16, 3), 255))
 
 
 def test_collect_run_shows_a_run_whose_painting_is_gone(runs, tmp_path):
