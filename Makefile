@@ -43,7 +43,7 @@ else
 endif
 
 bench: $(READY)
-	set -e; for name in hash_grid nnfm stage2_step render memory scaling effects; do \
+	set -e; for name in hash_grid nnfm stage2_step render memory scaling effects profile; do \
 	    $(BIN)/python -m benchmarks.$$name $(BENCH); \
 	done; for peer in even vanilla-nerf; do \
 	    $(BIN)/python -m benchmarks.stage1 --peer $$peer $(BENCH); \

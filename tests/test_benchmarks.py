@@ -12,7 +12,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))  # benchmarks isn't in
 
 from nerfstudio.data.scene_box import SceneBox
 
-from benchmarks import _measure, _scene, effects, nnfm, stability, stage1, summary
+from benchmarks import _measure, _scene, effects, nnfm, profile, stability, stage1, summary
 from benchmarks._measure import Duration, Options, Ratio, Report
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation import machine
@@ -333,6 +333,18 @@ def test_a_benchmark_can_be_run_as_a_command(tmp_path):
     assert content["quick"]
     assert [row["name"] for row in content["rows"]] == ["hash_grid_forward", "hash_grid_forward_backward"]
     assert all(len(one["seconds"]) == 1 for part in content["repetitions"].values() for one in part.values())
+
+
+# ------------------------------------------------------------------------------------------------------------ profile
+
+
+def test_operators_are_gathered_into_parts_whose_shares_sum_to_one():
+    times = [("aten::addmm", 30.0), ("aten::mm", 10.0), ("_FusedBackward", 40.0), ("aten::mul", 20.0)]
+    found = profile.gather(times)
+    assert {part: content["share"] for part, content in found.items()} == pytest.approx(
+        {"hash grid": 0.4, "matrix products": 0.4, profile.REST: 0.2}
+    )
+    assert list(found["matrix products"]["operators"]) == ["aten::addmm", "aten::mm"]
 
 
 # ---------------------------------------------------------------------------------------------------------- stability
