@@ -21,6 +21,8 @@ from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.style.color import color_moments, gaussian_distance
 from sparsestyle_ns.style.image import load_style_image
 
+SEEDS = (0, 1, 2)
+"""Short trainings of one scene with different seeds differ by up to a decibel, so means over some are compared."""
 PARSERS = {"llff": LLFFDataParserConfig, "blender": BlenderDataParserConfig, "nerfstudio": NerfstudioDataParserConfig}
 
 
@@ -62,9 +64,10 @@ def small_config(method: str, folder: Path, layout: str, steps: int, effects: Di
     return config
 
 
-def trained(config: Any, coarse_state: Optional[Dict[str, Tensor]] = None) -> Any:
+def trained(config: Any, coarse_state: Optional[Dict[str, Tensor]] = None, seed: int = 0) -> Any:
     """The pipeline after all iterations of its config."""
-    torch.manual_seed(0)
+    torch.manual_seed(seed)
+    config.pipeline.datamanager.seed += seed
     training = Training(config, torch.device("cpu"), coarse_state)
     for _ in range(config.max_num_iterations):
         training.step()
@@ -73,7 +76,7 @@ def trained(config: Any, coarse_state: Optional[Dict[str, Tensor]] = None) -> An
 
 
 def trained_coarse(
-    folder: Path, layout: str, steps: int, effects: Dict[str, str], num_views: Optional[int] = None
+    folder: Path, layout: str, steps: int, effects: Dict[str, str], num_views: Optional[int] = None, seed: int = 0
 ) -> Any:
     """Stage 1, shortened."""
     config = small_config("coarse-fewshot-draft", folder, layout, steps, effects)
@@ -81,8 +84,9 @@ def trained_coarse(
         config.pipeline.datamanager.num_views = num_views
     model = config.pipeline.model
     model.num_samples, model.num_eval_samples, model.grid_resolution = 16, 32, 32
+    model.seed += seed
     config.optimizers["fields"]["optimizer"].lr, config.optimizers["fields"]["scheduler"] = 5e-3, None
-    return trained(config)
+    return trained(config, seed=seed)
 
 
 def trained_style(
@@ -109,9 +113,10 @@ def held_out_views(pipeline: Any) -> List[Tuple[Tensor, Tensor]]:
 def held_out_psnr(
     folder: Path, layout: str, steps: int, effects: Dict[str, str], num_views: Optional[int] = None
 ) -> float:
-    """Mean PSNR, in dB, of the held-out views after a short training on others; on all, if not told how many."""
-    views = held_out_views(trained_coarse(folder, layout, steps, effects, num_views))
-    return sum(psnr(*view) for view in views) / len(views)
+    """Mean PSNR, in dB, of the held-out views after short trainings on others; on all, if not told how many."""
+    runs = [trained_coarse(folder, layout, steps, effects, num_views, seed) for seed in SEEDS]
+    values = [psnr(*view) for run in runs for view in held_out_views(run)]
+    return sum(values) / len(values)
 
 
 @pytest.mark.slow
@@ -120,10 +125,11 @@ def held_out_psnr(
     [
         ("llff", (), {"ndc": "on"}, {"contraction": "on"}),
         ("blender", (), {"box": "on"}, {"contraction": "on"}),
-        ("nerfstudio", ("--num-views", "48"), {"contraction": "on"}, {"box": "on"}),
+        ("nerfstudio", (), {"contraction": "on"}, {"box": "on"}),
         ("blender", (), {"background": "on"}, {"background": "off"}),
-        ("llff", ("--num-views", "48", "--shiny", "0.8"), {"view_color": "on"}, {"view_color": "off"}),
+        ("llff", ("--shiny", "0.8"), {"view_color": "on"}, {"view_color": "off"}),
         ("llff", ("--exposure", "0.7"), {"exposure": "on"}, {"exposure": "off"}),
+        ("nerfstudio", ("--distortion", "0.4"), {"lens_distortion": "on"}, {"lens_distortion": "off"}),
         ("blender", (), {"empty_space": "on"}, {"empty_space": "off"}),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else None,
@@ -131,6 +137,7 @@ def held_out_psnr(
 def test_an_effect_that_a_scene_calls_for_makes_held_out_views_better(scenes, layout, options, on, off):
     folder = scenes(layout, *options)
     with_it, without = (held_out_psnr(folder, layout, 300, effects) for effects in (on, off))
+    print(f"{layout} {options} {on}: {with_it:.2f} dB, {off}: {without:.2f} dB")
     assert with_it > without
 
 
