@@ -45,7 +45,7 @@ endif
 bench: $(READY)
 	set -e; for name in hash_grid nnfm stage2_step render memory scaling effects profile; do \
 	    $(BIN)/python -m benchmarks.$$name $(BENCH); \
-	done; for peer in even vanilla-nerf; do \
+	done; for peer in dense even vanilla-nerf; do \
 	    $(BIN)/python -m benchmarks.stage1 --peer $$peer $(BENCH); \
 	done
 	$(BIN)/python -m benchmarks.stability --method coarse-fewshot-draft $(BENCH)

@@ -9,7 +9,16 @@ import tyro
 from benchmarks._measure import Options, write_json
 from sparsestyle_ns.errors import InputError, exit_on_input_error
 
-BENCHMARKS = ("stage1_vanilla_nerf", "stage1_even", "hash_grid", "nnfm", "stage2_step", "render", "memory")
+BENCHMARKS = (
+    "stage1_vanilla_nerf",
+    "stage1_dense",
+    "stage1_even",
+    "hash_grid",
+    "nnfm",
+    "stage2_step",
+    "render",
+    "memory",
+)
 """In the order of the table."""
 
 

@@ -958,6 +958,7 @@ def write_nerfstudio(
     exposure: float = 0.0,
     shine: float = 0.0,
     distortion: float = 0.0,
+    wander: float = 0.0,
 ) -> None:
     """Writes `images` and `transforms.json` of `objects_on_a_plinth` in a landscape into `folder`.
 
@@ -973,6 +974,7 @@ def write_nerfstudio(
         exposure: Stops by which training pictures differ; see `photo_gains`.
         shine: See `Scene`.
         distortion: k1 of the lens; see `render_sample`.
+        wander: How far from the objects' middle, at most along each axis of the ground, a camera may look.
     """
     height = round(width * 0.75) if height is None else height
     focal = LLFF_FOCAL_PER_WIDTH * width
@@ -980,12 +982,13 @@ def write_nerfstudio(
     names = [f"images/image{i:03d}.png" for i in range(num_views)]
     held_out = [i for i in range(num_views) if i % 8 == 0 and num_views > 8]
     gains = photo_gains(num_views, exposure, held_out, seed)
+    aside = wander * np.random.default_rng([seed, 2]).uniform(-1, 1, (num_views, 2))
     (folder / "images").mkdir()
     frames = []
     for i, name in enumerate(names):
         angle = 2 * math.pi * i / num_views
         flat, height_above = 2.6, 1.0 + 0.5 * math.sin(3 * angle)
-        pose = look_at((flat * math.cos(angle), flat * math.sin(angle), height_above), (0, 0, -0.1))
+        pose = look_at((flat * math.cos(angle), flat * math.sin(angle), height_above), (*aside[i], -0.1))
         rgb, _, _ = render_sample(pose, focal, height, width, scene, supersample, distortion)
         imageio.imwrite(folder / name, _to_bytes(rgb * gains[i]))
         frames.append({"file_path": name, "transform_matrix": pose.tolist()})
@@ -1061,6 +1064,7 @@ def _parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:
     parser.add_argument("--shiny", type=float, default=0.0, help="brightness of a lamp's reflection, 0 to 1")
     parser.add_argument("--haze", type=float, default=0.0, help="llff: extinction of a mist a scene unit, 0 to 10")
     parser.add_argument("--distortion", type=float, default=0.0, help="nerfstudio: k1 of the lens, -0.2 to 0.5")
+    parser.add_argument("--wander", type=float, default=0.0, help="nerfstudio: how far aside cameras look, 0 to 1")
     parser.add_argument("--seed", type=int, default=0, help="which textures and cameras")
     parser.add_argument("--force", action="store_true", help="replace what OUTPUT holds already")
     options = parser.parse_args(arguments)
@@ -1073,7 +1077,7 @@ def _parse(arguments: Optional[Sequence[str]]) -> argparse.Namespace:
         parser.error(f"--supersample is {options.supersample}, but has to be odd")
     for name, low, high in (
         *(("exposure", 0.0, 3.0), ("shiny", 0.0, 1.0)),
-        *(("haze", 0.0, 10.0), ("distortion", -0.2, 0.5)),
+        *(("haze", 0.0, 10.0), ("distortion", -0.2, 0.5), ("wander", 0.0, 1.0)),
     ):
         if not low <= getattr(options, name) <= high:
             parser.error(f"--{name} is {getattr(options, name)}, but has to be between {low} and {high}")
@@ -1112,7 +1116,12 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
                 options.output / "nerfstudio",
                 options.force,
                 lambda folder: write_nerfstudio(
-                    folder, options.num_views, **size, **common, distortion=options.distortion
+                    folder,
+                    options.num_views,
+                    **size,
+                    **common,
+                    distortion=options.distortion,
+                    wander=options.wander,
                 ),
             )
     except OSError as error:

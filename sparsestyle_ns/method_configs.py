@@ -26,12 +26,12 @@ def _logging(steps_per_log: int) -> LoggingConfig:
 
 def _coarse_fewshot(draft: bool) -> TrainerConfig:
     """Stage 1; the draft is for images of about 128 pixels and two CPU cores."""
-    iterations = 1500 if draft else 50_000
+    iterations = 2500 if draft else 50_000
     return SparseStyleTrainerConfig(
         _target=CoarseFewShotTrainer,
         method_name="coarse-fewshot-draft" if draft else "coarse-fewshot",
         max_num_iterations=iterations,
-        steps_per_save=500 if draft else 5000,
+        steps_per_save=1000 if draft else 5000,
         steps_per_eval_batch=0,
         steps_per_eval_image=0,
         preview_side=80 if draft else 256,

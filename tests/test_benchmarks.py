@@ -1,3 +1,4 @@
+import copy
 import importlib
 import json
 import subprocess
@@ -20,6 +21,7 @@ from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.losses.nnfm import nnfm_loss
+from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.rendering.density_grid import Occupancy
 from sparsestyle_ns.rendering.space import BoxSpace, ContractedSpace
 from sparsestyle_ns.rendering.volume import freeze_samples, render_stylised
@@ -345,6 +347,15 @@ def test_operators_are_gathered_into_parts_whose_shares_sum_to_one():
         {"hash grid": 0.4, "matrix products": 0.4, profile.REST: 0.2}
     )
     assert list(found["matrix products"]["operators"]) == ["aten::addmm", "aten::mm"]
+
+
+def test_stage_1_is_compared_with_fields_that_look_at_every_sample(monkeypatch):
+    ours = method_config(stage1.COARSE_METHOD)
+    monkeypatch.setattr(stage1, "our_config", lambda scene, options: copy.deepcopy(ours))
+    even, dense = (config(None, None).pipeline for config in (stage1.even_config, stage1.dense_config))
+    assert (even.effects.empty_space, dense.effects.empty_space) == ("off", "off")
+    assert even.model.num_samples == dense.model.num_samples == stage1.EVEN_SAMPLES
+    assert even.model.thinning > 0 and dense.model.thinning == 0
 
 
 # ---------------------------------------------------------------------------------------------------------- stability

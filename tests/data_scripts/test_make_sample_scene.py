@@ -409,3 +409,14 @@ def test_mist_takes_light_by_the_length_of_its_way(two_views):
 def test_mist_is_refused_where_objects_have_an_outline(tmp_path):
     with pytest.raises(SystemExit):
         main([str(tmp_path), "--layout", "blender", "--haze", "0.3"])
+
+
+def test_cameras_that_wander_look_past_each_other(tmp_path):
+    for name, flags in (("still", ()), ("wandering", ("--wander", "0.5"))):
+        sizes = ["--width", "8", "--num-views", "9", "--supersample", "1"]
+        assert main([str(tmp_path / name), "--layout", "nerfstudio", *sizes, *flags]) == 0
+        frames = json.loads((tmp_path / name / "nerfstudio" / "transforms.json").read_text())["frames"]
+        poses = np.array([frame["transform_matrix"] for frame in frames])
+        # How far the axes pass by the point that still cameras look at.
+        aside = np.linalg.norm(np.cross(poses[:, :3, 3] - (0, 0, -0.1), poses[:, :3, 2]), axis=-1)
+        assert aside.max() < 1e-5 if name == "still" else 0.1 < aside.max() < 0.5 * math.sqrt(2)
