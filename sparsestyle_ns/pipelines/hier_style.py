@@ -23,7 +23,7 @@ from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
 from sparsestyle_ns.processes import average_gradients, num_processes, own_share, put_together
-from sparsestyle_ns.progress import bar, track
+from sparsestyle_ns.progress import bar, say, track
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.volume import accumulation_of, seen_behind
 from sparsestyle_ns.schedules import content_weight
@@ -210,9 +210,13 @@ class HierStylePipeline(CheckedPipeline):
 
     def painting(self) -> Optional[StyleTargets]:
         """See `CheckedPipeline.painting`."""
-        if self.targets is None and self.config.style_image is not None and self.config.style_image.is_file():
-            return self.config.load_targets(self.device)
-        return self.targets
+        if self.targets is not None:
+            return self.targets
+        path = self.config.style_image
+        if path is None or not path.is_file():
+            say(f"The painting {path} isn't there any more, so nothing is measured against it.")
+            return None
+        return self.config.load_targets(self.device)
 
     def prepare_style(self) -> None:
         """Loads the painting and the feature network."""

@@ -52,13 +52,16 @@ def test_ns_eval_gives_the_same_figures(runs: SimpleNamespace, tmp_path: Path) -
         assert all(f"{key}_std" in found for key in ("psnr", "ssim") if key in found)
 
 
-def test_a_run_whose_painting_is_gone_is_measured_without_the_style(runs: SimpleNamespace, tmp_path: Path) -> None:
+def test_a_run_whose_painting_is_gone_is_measured_without_the_style_and_says_so(
+    runs: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     text = (runs.style / "config.yml").read_text()
     moved = tmp_path / "scene" / "hier-style" / "run"
     shutil.copytree(runs.style, moved)
     (moved / "config.yml").write_text(text.replace("painting.png", "gone.png"))
     means = evaluate_run(find_config(moved), tmp_path / "report.json").means
     assert "style_loss" not in means and "gram_distance" not in means
+    assert "gone.png isn't there any more, so nothing is measured against it." in capsys.readouterr().out
     assert "short_rmse" in means and "coarse_psnr" in means
 
 
