@@ -79,9 +79,9 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         """Makes sure, before hours of training, that the style image and the feature network can be loaded.
 
         Raises:
-            InputError: they can't.
+            InputError: see `load_targets`.
         """
-        self.load_targets(torch.device("cpu"))
+        self._load_style()
 
     def load_targets(self, device: torch.device) -> StyleTargets:
         """The painting as the feature network sees it.
@@ -89,12 +89,15 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         Raises:
             InputError: there is no style image or no weights, or they can't be read; style_features is below 1.
         """
+        image, backbone = self._load_style()
+        return self.targets_of(image.to(device), backbone.to(device))
+
+    def _load_style(self) -> Tuple[Float[Tensor, "3 H W"], VGGFeatures]:
         if self.style_image is None:
             raise InputError("There is no style image: name a painting with --style-image FILE.")
         if self.style_features is not None and self.style_features < 1:
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
-        image = load_style_image(self.style_image)
-        return self.targets_of(image.to(device), load_backbone(self.backbone, self.vgg_weights).to(device))
+        return load_style_image(self.style_image), load_backbone(self.backbone, self.vgg_weights)
 
     def targets_of(self, image: Float[Tensor, "3 H W"], backbone: VGGFeatures) -> StyleTargets:
         """A painting as a feature network on its device sees it, with these settings."""
