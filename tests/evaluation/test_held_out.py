@@ -4,12 +4,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 from conftest import run_entrypoint
 
 from sparsestyle_ns.cli import main
-from sparsestyle_ns.evaluation.held_out import evaluate_run, saved_report
+from sparsestyle_ns.evaluation.held_out import by_figure, evaluate_held_out, evaluate_run, saved_report
 from sparsestyle_ns.evaluation.tables import report_tables
-from sparsestyle_ns.run_folder import find_config
+from sparsestyle_ns.run_folder import find_config, load_run
 
 
 def test_baked_renders_are_held_against_exact_ones_when_asked_for(runs: SimpleNamespace, tmp_path: Path) -> None:
@@ -23,6 +24,19 @@ def test_baked_renders_are_held_against_exact_ones_when_asked_for(runs: SimpleNa
 
 def test_a_coarse_run_has_nothing_to_bake(runs: SimpleNamespace, tmp_path: Path) -> None:
     assert "baked_psnr" not in evaluate_run(find_config(runs.coarse), tmp_path / "coarse.json", baked=True).means
+
+
+def test_a_view_that_shows_no_surface_has_no_sharpness_and_the_report_is_json(runs: SimpleNamespace) -> None:
+    _, pipeline, _ = load_run(find_config(runs.coarse))
+    with torch.no_grad():
+        pipeline.model.field.density_head.weight.zero_()
+        pipeline.model.field.density_head.bias.fill_(-20.0)
+    pipeline.model.space.unbounded = False
+    report = evaluate_held_out(pipeline)
+    assert "psnr" in report.means and "effective_samples" not in report.means
+    json.dumps(report.means, allow_nan=False)
+    assert by_figure([{"a": 1.0, "b": 2.0}, {"a": 3.0}]) == {"a": [1.0, 3.0], "b": [2.0]}
+    assert "effective_samples_std" not in report.deviations() and "psnr_std" in report.deviations()
 
 
 def test_a_stylised_run_is_measured_for_truth_consistency_style_and_content(runs: SimpleNamespace) -> None:
