@@ -24,7 +24,7 @@ from sparsestyle_ns.effects.matched_depth import MatchedRays
 from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings, decide
 from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.photos import PhotoDataset, check_one_size, open_photo
+from sparsestyle_ns.photos import SMALLEST_SIDE, PhotoDataset, check_one_size, open_photo
 from sparsestyle_ns.processes import num_processes
 from sparsestyle_ns.view_selection import BLENDER_VIEWS, DEFAULT_NUM_VIEWS, select_views
 
@@ -96,6 +96,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
 
     def create_train_dataset(self) -> PhotoDataset:
         """The dataset of the selected views only."""
+        self._check_settings()
         outputs = self.train_dataparser_outputs
         ids = outputs.metadata.get("view_ids", list(range(len(outputs.image_filenames))))
         forward_facing = outputs.metadata.get("space") == "ndc"
@@ -116,6 +117,13 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
             )
         self.effects = self.config.decided or decide(self.scene, self.config.effects)
         return self._dataset(self.train_dataparser_outputs)
+
+    def _check_settings(self) -> None:
+        side, rays = self.config.max_image_side, self.config.train_num_rays_per_batch
+        if side is not None and side < SMALLEST_SIDE:
+            raise InputError(f"--max-image-side is {side}; give {SMALLEST_SIDE} pixels or more.")
+        if rays < 1:
+            raise InputError(f"--pipeline.datamanager.train-num-rays-per-batch is {rays}; give 1 or more.")
 
     @property
     def scene(self) -> Scene:

@@ -81,6 +81,13 @@ class SparseStyleTrainerConfig(TrainerConfig):
     @exit_on_input_error
     def save_config(self) -> None:
         """Writes config.yml into the run's folder; `ns-train` calls it right before it starts processes."""
+        gpus = torch.cuda.device_count()
+        if self.machine.device_type == "cuda" and self.machine.num_devices > gpus:
+            raise InputError(
+                f"--machine.device-type is cuda and --machine.num-devices {self.machine.num_devices}, but torch finds "
+                f"{gpus or 'no'} GPU{'s' * (gpus > 1)} here; "
+                + ("ask for fewer." if gpus else "give --machine.device-type cpu.")
+            )
         if self.machine.num_devices * self.machine.num_machines > 1:
             prepare_launch()
         try:

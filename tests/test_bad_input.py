@@ -83,6 +83,19 @@ def test_views_that_dont_exist_are_named(llff_scene: Path, tmp_path: Path, flags
     assert words in refusal("coarse-fewshot", llff_scene, tmp_path, *flags)
 
 
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--max-image-side", "0"], "--max-image-side is 0; give 8 pixels or more"),
+        (["--pipeline.datamanager.train-num-rays-per-batch", "0"], "rays-per-batch is 0; give 1 or more"),
+        (["--pipeline.model.even-share", "0"], "--pipeline.model.even-share is 0.0; give a number above 0"),
+        (["--machine.device-type", "cuda", "--machine.num-devices", "99"], "--machine.num-devices 99, but torch finds"),
+    ],
+)
+def test_numbers_that_no_run_can_have_are_named(llff_scene: Path, tmp_path: Path, flags: List[str], words: str) -> None:
+    assert words in refusal("coarse-fewshot", llff_scene, tmp_path, *flags)
+
+
 def test_a_coarse_run_of_another_scene_is_refused(
     runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path
 ) -> None:
