@@ -278,6 +278,7 @@ def _write_study(
     Args:
         next_command: what to type next, from the options and the folders of our own stylised runs.
     """
+    from sparsestyle_ns.dataparsers.choice import check_parser
     from sparsestyle_ns.evaluation.experiments import Laboratory, SceneSettings
     from sparsestyle_ns.evaluation.study import Study
     from sparsestyle_ns.evaluation.study_page import write_study
