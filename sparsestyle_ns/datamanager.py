@@ -24,7 +24,7 @@ from sparsestyle_ns.effects.matched_depth import MatchedRays
 from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings, decide
 from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.photos import SMALLEST_SIDE, PhotoDataset, check_one_size, open_photo
+from sparsestyle_ns.photos import SMALLEST_SIDE, PhotoDataset, at_size, check_one_size, open_photo
 from sparsestyle_ns.processes import num_processes
 from sparsestyle_ns.view_selection import BLENDER_VIEWS, DEFAULT_NUM_VIEWS, select_views
 
@@ -143,8 +143,10 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         longest = int(max(outputs.cameras.width.max(), outputs.cameras.height.max()))
         scale = self.config.camera_res_scale_factor
         if limit is not None and longest * scale > limit:
-            scale = limit / longest
+            # A little more, as nerfstudio cuts sides off to whole pixels, photos' and masks' in different precision.
+            scale = (1.0 + 1e-6) * limit / longest
         dataset = self.dataset_type(dataparser_outputs=outputs, scale_factor=scale)
+        dataset.cameras = at_size(outputs.cameras, dataset.cameras.width, dataset.cameras.height)
         dataset.cameras.distortion_params = self.effects.build("lens_distortion", cameras=dataset.cameras)
         dataset.metadata.update(effects=self.effects, view_ids=self.view_ids)
         return dataset
