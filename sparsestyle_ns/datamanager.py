@@ -15,6 +15,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOu
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.data.utils.dataloaders import RandIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
@@ -154,6 +155,22 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
     def setup_train(self) -> None:
         """Loads the photos and generates all their rays once."""
         self.pixels = gather_pixels(self.train_dataset, self.device)
+
+    def setup_eval(self) -> None:
+        """Sees to it that held-out photos can be used.
+
+        nerfstudio would keep all of them in memory, for batches of their pixels that few ask for (`next_eval`).
+        """
+        if self.test_mode == "val":
+            for index in range(len(self.eval_dataset)):
+                self.eval_dataset.get_data(index, "uint8")
+        self.eval_dataloader = RandIndicesEvalDataloader(self.eval_dataset, self.device)
+
+    def next_eval(self, step: int) -> Tuple[RayBundle, Dict[str, Any]]:
+        """A batch of random pixels of held-out views; from the first one on all of their photos are in memory."""
+        if not hasattr(self, "eval_image_dataloader"):
+            super().setup_eval()
+        return super().next_eval(step)
 
     @functools.cached_property
     def matched(self) -> Optional[MatchedRays]:

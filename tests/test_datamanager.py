@@ -1,5 +1,7 @@
 """What the data manager makes of a scene's photos and cameras."""
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from test_commands import write_ring, write_transforms
 
 from sparsestyle_ns.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
+from sparsestyle_ns.errors import InputError
 
 
 def photos(data, dataparser, side):
@@ -47,3 +50,23 @@ def test_photos_and_their_masks_are_reduced_to_the_size_asked_for(tmp_path, side
     (tmp_path / "transforms.json").write_text(text)
     data = photos(tmp_path, NerfstudioDataParserConfig(), 126)[0]
     assert data["image"].shape[:2] == data["mask"].shape[:2] == (126, 126)
+
+
+def test_held_out_photos_are_kept_in_memory_only_where_batches_of_their_pixels_are_asked_for(llff_scene):
+    config = FewShotDataManagerConfig(data=llff_scene, dataparser=LLFFDataParserConfig(), eval_num_rays_per_batch=7)
+    manager = config.setup(device="cpu", test_mode="val")
+    assert not hasattr(manager, "eval_image_dataloader")
+    camera, view = manager.next_eval_image(0)
+    assert view["image"].shape == (24, 32, 3) and len(camera) == 1
+    assert not hasattr(manager, "eval_image_dataloader")
+    rays, batch = manager.next_eval(0)
+    assert len(rays) == len(batch["image"]) == 7
+    assert len(manager.eval_image_dataloader.cached_collated_batch["image"]) == 2
+
+
+def test_a_held_out_photo_that_cant_be_used_is_named_before_training(llff_scene, tmp_path):
+    scene = shutil.copytree(llff_scene, tmp_path / "scene")
+    Image.new("RGB", (32, 24)).save(scene / "images" / "image008.png")
+    config = FewShotDataManagerConfig(data=scene, dataparser=LLFFDataParserConfig())
+    with pytest.raises(InputError, match=r"image008\.png is black all over"):
+        config.setup(device="cpu", test_mode="val")
