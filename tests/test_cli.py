@@ -18,6 +18,13 @@ def run_main(arguments, capsys):
     return ended.value.code, capsys.readouterr().out
 
 
+def write_configs(folder):
+    """A stylised run and a coarse one, as far as their folders tell."""
+    for name, method in (("run", "hier-style"), ("coarse", "coarse-fewshot")):
+        (folder / name).mkdir()
+        (folder / name / "config.yml").write_text(f"method_name: {method}\n")
+
+
 def test_help_lists_every_subcommand(capsys):
     status, printed = run_main(["--help"], capsys)
     assert status == 0
@@ -49,9 +56,7 @@ def test_help_loads_neither_torch_nor_nerfstudio():
     ],
 )
 def test_what_can_not_be_used_is_said_in_one_sentence(tmp_path, capsys, arguments, sentence):
-    for name, method in (("run", "hier-style"), ("coarse", "coarse-fewshot")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "config.yml").write_text(f"method_name: {method}\n")
+    write_configs(tmp_path)
     given = [argument.format(tmp=tmp_path) for argument in arguments]
     if "--output-path" not in given:
         given += ["--output-path", str(tmp_path / "page.html")]
@@ -104,9 +109,7 @@ def test_gallery_gives_each_run_its_video_and_says_last_where_the_page_is(tmp_pa
     ],
 )
 def test_evaluate_leaves_out_nothing_that_was_asked_for(tmp_path, capsys, run, arguments, sentence):
-    for name, method in (("run", "hier-style"), ("coarse", "coarse-fewshot")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "config.yml").write_text(f"method_name: {method}\n")
+    write_configs(tmp_path)
     given = [argument.format(tmp=tmp_path) for argument in arguments]
     message, _ = run_main(["evaluate", str(tmp_path / run), *given, "--output-path", str(tmp_path / "a.json")], capsys)
     assert message.startswith(sentence.format(tmp=tmp_path))

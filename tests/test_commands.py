@@ -267,12 +267,18 @@ def test_a_run_remembers_where_its_painting_is(
     assert config.pipeline.style_image == painting.resolve()
 
 
-def test_hier_style_trains_the_coarse_run_itself_where_there_is_none(
-    llff_scene: Path, painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def short_coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Makes coarse-fewshot a method of two iterations of a narrow field."""
     coarse = method_config("coarse-fewshot")
     monkeypatch.setattr(coarse, "max_num_iterations", 2)
     monkeypatch.setattr(coarse.pipeline.model.coarse_field, "layer_width", 32)
+
+
+@pytest.mark.usefixtures("short_coarse")
+def test_hier_style_trains_the_coarse_run_itself_where_there_is_none(
+    llff_scene: Path, painting: Path, tmp_path: Path
+) -> None:
     style = ["--style-image", str(painting), "--num-views", "2", "--max-num-iterations", "2", *TINY_STYLE]
     ns_train("hier-style", llff_scene, tmp_path, *style)
     trained, stylised = only_run(tmp_path, "coarse-fewshot"), only_run(tmp_path, "hier-style")
@@ -282,14 +288,12 @@ def test_hier_style_trains_the_coarse_run_itself_where_there_is_none(
     assert load(trained)["step"] == load(stylised)["step"] == 1
 
 
+@pytest.mark.usefixtures("short_coarse")
 def test_a_coarse_run_that_ctrl_c_ends_within_hier_style_is_finished_by_the_command_it_names(
     llff_scene: Path, painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from nerfstudio.scripts import train
 
-    coarse = method_config("coarse-fewshot")
-    monkeypatch.setattr(coarse, "max_num_iterations", 2)
-    monkeypatch.setattr(coarse.pipeline.model.coarse_field, "layer_width", 32)
     style = ["--style-image", str(painting), "--num-views", "2", "--max-num-iterations", "1", *TINY_STYLE]
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as ended:
         press_ctrl_c_at(patch, step=0)
