@@ -487,7 +487,7 @@ class HierStyleTrainer(SparseStyleTrainer):
         if asked is not None:
             run = read_coarse_run(asked)
             check_scene(run, scene)
-            CONSOLE.print(f"Stylising the coarse run {run.folder}.")
+            CONSOLE.print(f"Stylising the coarse run {run.in_words()}.", soft_wrap=True)
             return run
         draft = self.config.method_name.endswith("-draft")
         methods = ("coarse-fewshot", "coarse-fewshot-draft") if draft else ("coarse-fewshot",)

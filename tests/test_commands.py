@@ -23,7 +23,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.trainer import Trainer
 from scipy.spatial.transform import Rotation
 
-from sparsestyle_ns.coarse_run import newest_checkpoint
+from sparsestyle_ns.coarse_run import newest_checkpoint, read_coarse_run
 from sparsestyle_ns.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.effects.registry import EFFECTS
 from sparsestyle_ns.method_configs import method_config
@@ -265,6 +265,14 @@ def test_a_run_remembers_where_its_painting_is(
     ns_train("hier-style", llff_scene, tmp_path, *flags, *TINY_STYLE)
     config = yaml.load((only_run(tmp_path, "hier-style") / "config.yml").read_text(), Loader=yaml.Loader)
     assert config.pipeline.style_image == painting.resolve()
+
+
+def test_a_coarse_run_that_isnt_finished_is_said_to_be(runs: SimpleNamespace, tmp_path: Path) -> None:
+    assert read_coarse_run(runs.coarse).in_words() == str(runs.coarse)
+    folder = shutil.copytree(runs.coarse, tmp_path / "run")
+    config = (folder / "config.yml").read_text().replace("max_num_iterations: 3", "max_num_iterations: 30")
+    (folder / "config.yml").write_text(config)
+    assert read_coarse_run(folder).in_words() == f"{folder}, which isn't finished (3 of 30 iterations)"
 
 
 @pytest.fixture
