@@ -88,13 +88,18 @@ def evaluate(
         baked: Also measure how close a stylised run's baked renders are to exact ones (PSNR in dB).
     """
     from sparsestyle_ns.output_file import prepare_output
-    from sparsestyle_ns.run_folder import REPORT_FILE, find_config
+    from sparsestyle_ns.run_folder import REPORT_FILE, STYLE_METHOD, find_config
 
-    config = find_config(run)
+    needs_style = baked or style_image is not None
+    config = find_config(run, STYLE_METHOD if needs_style else "")
     if output_path is None and style_image is not None:
         raise InputError(f"{REPORT_FILE} in the run's folder is for its own painting; name a file with --output-path.")
     path = output_path or config.parent / REPORT_FILE
     prepare_output(path, "The report", "report.json")  # measuring takes minutes, so what can fail fails before
+    if style_image is not None:
+        from sparsestyle_ns.style.image import load_style_image
+
+        load_style_image(style_image)
     from sparsestyle_ns.evaluation.held_out import evaluate_run
     from sparsestyle_ns.evaluation.tables import report_tables
     from sparsestyle_ns.next_command import after_evaluation, finish
@@ -273,6 +278,7 @@ def _write_study(
     Args:
         next_command: what to type next, from the options and the folders of our own stylised runs.
     """
+    from sparsestyle_ns.dataparsers.choice import check_parser
     from sparsestyle_ns.evaluation.experiments import Laboratory, SceneSettings
     from sparsestyle_ns.evaluation.study import Study
     from sparsestyle_ns.evaluation.study_page import write_study
@@ -280,6 +286,7 @@ def _write_study(
     from sparsestyle_ns.page import prepare_page
     from sparsestyle_ns.style.image import load_style_image
 
+    check_parser(options.parser)
     if not options.data.exists():
         raise InputError(f"There is no scene at --data {options.data}; name its folder.")
     if not options.style_images:
@@ -395,9 +402,13 @@ SUBCOMMANDS: Dict[str, Callable[..., Any]] = {
 
 def main(arguments: Optional[Sequence[str]] = None) -> None:
     """The command line; `arguments` default to the process's own."""
-    tyro.extras.subcommand_cli_from_dict(
-        SUBCOMMANDS,
-        prog="sparsestyle",
-        description="Tools around stylised scenes. Training, rendering and viewing are nerfstudio's ns-* commands.",
-        args=arguments,
-    )
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            SUBCOMMANDS,
+            prog="sparsestyle",
+            description="Tools around stylised scenes. Training, rendering and viewing are nerfstudio's ns-* commands.",
+            args=arguments,
+        )
+    except KeyboardInterrupt:
+        print("Stopped by Ctrl-C.", file=sys.stderr)
+        raise SystemExit(130) from None

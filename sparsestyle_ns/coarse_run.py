@@ -36,6 +36,13 @@ class CoarseRun:
         """Whether the newest checkpoint is that of the last iteration."""
         return checkpoint_step(self.checkpoint) + 1 >= self.config.max_num_iterations
 
+    def in_words(self) -> str:
+        """Where it is, and how far where it isn't finished."""
+        if self.is_finished:
+            return str(self.folder)
+        done, total = checkpoint_step(self.checkpoint) + 1, self.config.max_num_iterations
+        return f"{self.folder}, which isn't finished ({done} of {total} iterations)"
+
     def model_state(self) -> Dict[str, Tensor]:
         """The state of the run's model."""
         return under(load_checkpoint(self.checkpoint)["pipeline"], "_model.")

@@ -15,6 +15,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOu
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.data.utils.dataloaders import RandIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
@@ -24,7 +25,7 @@ from sparsestyle_ns.effects.matched_depth import MatchedRays
 from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings, decide
 from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.photos import PhotoDataset, check_one_size, open_photo
+from sparsestyle_ns.photos import SMALLEST_SIDE, PhotoDataset, at_size, check_one_size, open_photo
 from sparsestyle_ns.processes import num_processes
 from sparsestyle_ns.view_selection import BLENDER_VIEWS, DEFAULT_NUM_VIEWS, select_views
 
@@ -96,6 +97,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
 
     def create_train_dataset(self) -> PhotoDataset:
         """The dataset of the selected views only."""
+        self._check_settings()
         outputs = self.train_dataparser_outputs
         ids = outputs.metadata.get("view_ids", list(range(len(outputs.image_filenames))))
         forward_facing = outputs.metadata.get("space") == "ndc"
@@ -117,6 +119,13 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         self.effects = self.config.decided or decide(self.scene, self.config.effects)
         return self._dataset(self.train_dataparser_outputs)
 
+    def _check_settings(self) -> None:
+        side, rays = self.config.max_image_side, self.config.train_num_rays_per_batch
+        if side is not None and side < SMALLEST_SIDE:
+            raise InputError(f"--max-image-side is {side}; give {SMALLEST_SIDE} pixels or more.")
+        if rays < 1:
+            raise InputError(f"--pipeline.datamanager.train-num-rays-per-batch is {rays}; give 1 or more.")
+
     @property
     def scene(self) -> Scene:
         """The training views, for measuring."""
@@ -135,8 +144,10 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         longest = int(max(outputs.cameras.width.max(), outputs.cameras.height.max()))
         scale = self.config.camera_res_scale_factor
         if limit is not None and longest * scale > limit:
-            scale = limit / longest
+            # A little more, as nerfstudio cuts sides off to whole pixels, photos' and masks' in different precision.
+            scale = (1.0 + 1e-6) * limit / longest
         dataset = self.dataset_type(dataparser_outputs=outputs, scale_factor=scale)
+        dataset.cameras = at_size(outputs.cameras, dataset.cameras.width, dataset.cameras.height)
         dataset.cameras.distortion_params = self.effects.build("lens_distortion", cameras=dataset.cameras)
         dataset.metadata.update(effects=self.effects, view_ids=self.view_ids)
         return dataset
@@ -144,6 +155,22 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
     def setup_train(self) -> None:
         """Loads the photos and generates all their rays once."""
         self.pixels = gather_pixels(self.train_dataset, self.device)
+
+    def setup_eval(self) -> None:
+        """Sees to it that held-out photos can be used.
+
+        nerfstudio would keep all of them in memory, for batches of their pixels that few ask for (`next_eval`).
+        """
+        if self.test_mode == "val":
+            for index in range(len(self.eval_dataset)):
+                self.eval_dataset.get_data(index, "uint8")
+        self.eval_dataloader = RandIndicesEvalDataloader(self.eval_dataset, self.device)
+
+    def next_eval(self, step: int) -> Tuple[RayBundle, Dict[str, Any]]:
+        """A batch of random pixels of held-out views; from the first one on all of their photos are in memory."""
+        if not hasattr(self, "eval_image_dataloader"):
+            super().setup_eval()
+        return super().next_eval(step)
 
     @functools.cached_property
     def matched(self) -> Optional[MatchedRays]:

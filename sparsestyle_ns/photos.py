@@ -1,13 +1,16 @@
 """Photos of a scene: one that can't be trained on is found when it is read, and named."""
 
+import copy
 from collections import Counter
 from pathlib import Path
 from typing import Any, Dict, Literal, Sequence, Tuple
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
+from torch import Tensor
 
 from sparsestyle_ns.errors import InputError
 
@@ -79,6 +82,19 @@ def check_one_size(filenames: Sequence[Path]) -> None:
                 f"{filename} is {size[0]}x{size[1]} pixels, but the other images are {usual[0]}x{usual[1]}: bring all "
                 "of them to one size."
             )
+
+
+def at_size(cameras: Cameras, width: Int[Tensor, "views 1"], height: Int[Tensor, "views 1"]) -> Cameras:
+    """The same cameras for images of another size: each pixel's ray goes to what that pixel shows.
+
+    nerfstudio multiplies focal lengths and centres by the scale that was asked for, also where whole pixels make the
+    image's own another one: of 378 rows times 1/4, 94 are left, whose last ones then are half a pixel off.
+    """
+    resized = copy.deepcopy(cameras)
+    across, down = width / cameras.width, height / cameras.height
+    resized.fx, resized.cx, resized.width = cameras.fx * across, cameras.cx * across, width
+    resized.fy, resized.cy, resized.height = cameras.fy * down, cameras.cy * down, height
+    return resized
 
 
 def check_content(path: Path, pixels: UInt8[np.ndarray, "H W channels"]) -> None:

@@ -1,6 +1,7 @@
 """nerfstudio's trainer, made to keep what it has: whole checkpoints, also on Ctrl-C, and resuming where it stopped."""
 
 import copy
+import shlex
 import signal
 import warnings
 from abc import ABC, abstractmethod
@@ -34,7 +35,7 @@ from sparsestyle_ns.errors import InputError, exit_on_input_error
 from sparsestyle_ns.files import write_whole
 from sparsestyle_ns.finite_steps import FiniteOptimizers
 from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
-from sparsestyle_ns.next_command import finish, ns_train_style, resume_command
+from sparsestyle_ns.next_command import finish, ns_train_style, resume_command, scene_arguments
 from sparsestyle_ns.preview import preview_steps, render_preview, save_preview
 from sparsestyle_ns.processes import any_process, from_first_process, prepare_launch, share_state
 from sparsestyle_ns.progress import bar, say
@@ -80,6 +81,13 @@ class SparseStyleTrainerConfig(TrainerConfig):
     @exit_on_input_error
     def save_config(self) -> None:
         """Writes config.yml into the run's folder; `ns-train` calls it right before it starts processes."""
+        gpus = torch.cuda.device_count()
+        if self.machine.device_type == "cuda" and self.machine.num_devices > gpus:
+            raise InputError(
+                f"--machine.device-type is cuda and --machine.num-devices {self.machine.num_devices}, but torch finds "
+                f"{gpus or 'no'} GPU{'s' * (gpus > 1)} here; "
+                + ("ask for fewer." if gpus else "give --machine.device-type cpu.")
+            )
         if self.machine.num_devices * self.machine.num_machines > 1:
             prepare_launch()
         try:
@@ -233,7 +241,6 @@ class SparseStyleTrainer(Trainer, ABC):
         """One iteration.
 
         Raises:
-            TrainingInterruptedError: Ctrl-C was pressed, in any process.
             InputError: the gradients of too many iterations in a row weren't finite.
         """
         result = super().train_iteration(step)
@@ -243,9 +250,6 @@ class SparseStyleTrainer(Trainer, ABC):
         self._bar.advance(note=note)
         if (step + 1) % STEPS_PER_LOOK == 0:
             self._look_at_skipped(step)
-        self._interrupted = any_process(self._interrupted, self.pipeline.device)
-        if self._interrupted:
-            raise TrainingInterruptedError
         return result
 
     def _look_at_skipped(self, step: int) -> int:
@@ -269,10 +273,18 @@ class SparseStyleTrainer(Trainer, ABC):
         return in_a_row
 
     def eval_iteration(self, step: int) -> None:
-        """What nerfstudio evaluates after an iteration, and the preview after some."""
+        """What nerfstudio evaluates after an iteration, and the preview after some; then it is over.
+
+        Raises:
+            TrainingInterruptedError: Ctrl-C was pressed, in any process.
+        """
         if step + 1 in self._preview_steps:
             self._write_preview(step + 1)
         super().eval_iteration(step)
+        # Not before: what callbacks decide after an iteration wouldn't be in the checkpoint.
+        self._interrupted = any_process(self._interrupted, self.pipeline.device)
+        if self._interrupted:
+            raise TrainingInterruptedError
 
     @check_main_thread
     def _write_preview(self, iterations: int) -> None:
@@ -409,7 +421,11 @@ class HierStyleTrainer(SparseStyleTrainer):
     @exit_on_input_error
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Checks the style's files, makes sure of a coarse run, and sets up the stylised run."""
-        self.config.pipeline.check_style()
+        pipeline = self.config.pipeline
+        pipeline.check_style()
+        for name in ("style_image", "vgg_weights"):  # the run may be measured from another folder
+            path: Optional[Path] = getattr(pipeline, name)
+            setattr(pipeline, name, None if path is None else path.expanduser().resolve())
         run = None
         if self.config.load_dir is None and self.config.load_checkpoint is None:
             manager = self._photos()
@@ -471,7 +487,7 @@ class HierStyleTrainer(SparseStyleTrainer):
         if asked is not None:
             run = read_coarse_run(asked)
             check_scene(run, scene)
-            CONSOLE.print(f"Stylising the coarse run {run.folder}.")
+            CONSOLE.print(f"Stylising the coarse run {run.in_words()}.", soft_wrap=True)
             return run
         draft = self.config.method_name.endswith("-draft")
         methods = ("coarse-fewshot", "coarse-fewshot-draft") if draft else ("coarse-fewshot",)
@@ -522,8 +538,10 @@ class HierStyleTrainer(SparseStyleTrainer):
         trainer.setup()
         trainer.train_to_end()
         if trainer._interrupted:
+            resume = ["ns-train", method, "--load-dir", str(trainer.checkpoint_dir), *scene_arguments(config, method)]
             raise InputError(
-                "The coarse run was interrupted, so there is nothing to stylise yet; run the command again."
+                "The coarse run was interrupted, so there is nothing to stylise yet; finish it with "
+                f"{shlex.join(resume)} and run this command again."
             )
         for state in (writer.EVENT_WRITERS, writer.EVENT_STORAGE, writer.GLOBAL_BUFFER):
             state.clear()

@@ -1,9 +1,11 @@
 """What the commands say when they can't go on: one sentence, exit status not 0, and nothing is lost."""
 
+import copy
 import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import List
@@ -11,7 +13,11 @@ from typing import List
 import numpy as np
 import pytest
 from conftest import TINY, TINY_STYLE, ns_train
+from nerfstudio.configs.dataparser_configs import all_dataparsers
 from PIL import Image
+
+from sparsestyle_ns.datamanager import FewShotDataManagerConfig
+from sparsestyle_ns.errors import InputError
 
 
 def refusal(method: str, scene: Path, outputs: Path, *flags: str) -> str:
@@ -55,6 +61,29 @@ def test_a_folder_without_poses_says_what_is_missing(tmp_path: Path) -> None:
     assert "poses_bounds.npy" in message
 
 
+@pytest.mark.parametrize(
+    ("file", "given", "named"),
+    [
+        ("poses_bounds.npy", "blender-data", "llff-data"),
+        ("transforms.json", "blender-data", "nerfstudio-data"),
+        ("transforms_train.json", "nerfstudio-data", "blender-data"),
+        ("transforms_train.json", "llff-data", "blender-data"),
+    ],
+)
+def test_a_scene_for_another_dataparser_has_that_one_named(tmp_path: Path, file: str, given: str, named: str) -> None:
+    (tmp_path / file).touch()
+    config = replace(all_dataparsers[given], data=tmp_path)
+    with pytest.raises(InputError, match=f"it has {file}, which {named} reads: put {named} at the end of the command"):
+        FewShotDataManagerConfig(dataparser=config).setup(device="cpu", test_mode="inference")
+
+
+def test_a_folder_that_isnt_there_is_named(tmp_path: Path) -> None:
+    for parser in ("llff-data", "blender-data", "nerfstudio-data"):
+        config = FewShotDataManagerConfig(data=tmp_path / "gone", dataparser=copy.deepcopy(all_dataparsers[parser]))
+        with pytest.raises(InputError, match=r"There is no folder .*/gone.*--data"):
+            config.setup(device="cpu", test_mode="inference")
+
+
 def test_photos_that_dont_match_the_poses_in_number_are_counted(llff_scene: Path, tmp_path: Path) -> None:
     scene = shutil.copytree(llff_scene, tmp_path / "scene")
     (scene / "images" / "image003.png").unlink()
@@ -80,6 +109,19 @@ def test_a_photo_of_another_size_is_named(llff_scene: Path, tmp_path: Path) -> N
     ],
 )
 def test_views_that_dont_exist_are_named(llff_scene: Path, tmp_path: Path, flags: List[str], words: str) -> None:
+    assert words in refusal("coarse-fewshot", llff_scene, tmp_path, *flags)
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--max-image-side", "0"], "--max-image-side is 0; give 8 pixels or more"),
+        (["--pipeline.datamanager.train-num-rays-per-batch", "0"], "rays-per-batch is 0; give 1 or more"),
+        (["--pipeline.model.even-share", "0"], "--pipeline.model.even-share is 0.0; give a number above 0"),
+        (["--machine.device-type", "cuda", "--machine.num-devices", "99"], "--machine.num-devices 99, but torch finds"),
+    ],
+)
+def test_numbers_that_no_run_can_have_are_named(llff_scene: Path, tmp_path: Path, flags: List[str], words: str) -> None:
     assert words in refusal("coarse-fewshot", llff_scene, tmp_path, *flags)
 
 

@@ -18,6 +18,13 @@ def run_main(arguments, capsys):
     return ended.value.code, capsys.readouterr().out
 
 
+def write_configs(folder):
+    """A stylised run and a coarse one, as far as their folders tell."""
+    for name, method in (("run", "hier-style"), ("coarse", "coarse-fewshot")):
+        (folder / name).mkdir()
+        (folder / name / "config.yml").write_text(f"method_name: {method}\n")
+
+
 def test_help_lists_every_subcommand(capsys):
     status, printed = run_main(["--help"], capsys)
     assert status == 0
@@ -49,9 +56,7 @@ def test_help_loads_neither_torch_nor_nerfstudio():
     ],
 )
 def test_what_can_not_be_used_is_said_in_one_sentence(tmp_path, capsys, arguments, sentence):
-    for name, method in (("run", "hier-style"), ("coarse", "coarse-fewshot")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "config.yml").write_text(f"method_name: {method}\n")
+    write_configs(tmp_path)
     given = [argument.format(tmp=tmp_path) for argument in arguments]
     if "--output-path" not in given:
         given += ["--output-path", str(tmp_path / "page.html")]
@@ -93,6 +98,30 @@ def test_gallery_gives_each_run_its_video_and_says_last_where_the_page_is(tmp_pa
     assert target.read_text() == "<html>"
     export = f"sparsestyle export {tmp_path / 'first'} --format html --output-path scene.html"
     assert capsys.readouterr().out.splitlines()[-1] == f"Made {target} – next: {export}"
+
+
+@pytest.mark.parametrize(
+    ("run", "arguments", "sentence"),
+    [
+        ("run", ["--style-image", "{tmp}/gone.jpg"], "Error: The style image {tmp}/gone.jpg does not exist"),
+        ("coarse", ["--style-image", "{tmp}/a.jpg"], "Error: {tmp}/coarse is a run of coarse-fewshot;"),
+        ("coarse", ["--baked"], "Error: {tmp}/coarse is a run of coarse-fewshot;"),
+    ],
+)
+def test_evaluate_leaves_out_nothing_that_was_asked_for(tmp_path, capsys, run, arguments, sentence):
+    write_configs(tmp_path)
+    given = [argument.format(tmp=tmp_path) for argument in arguments]
+    message, _ = run_main(["evaluate", str(tmp_path / run), *given, "--output-path", str(tmp_path / "a.json")], capsys)
+    assert message.startswith(sentence.format(tmp=tmp_path))
+
+
+def test_ctrl_c_ends_a_command_without_a_traceback(tmp_path, capsys, monkeypatch):
+    def press(*given):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sparsestyle_ns.run_folder.find_config", press)
+    status, printed = run_main(["evaluate", str(tmp_path)], capsys)
+    assert (status, printed) == (130, "")
 
 
 def test_another_painting_is_not_measured_into_the_runs_own_report(tmp_path, capsys):

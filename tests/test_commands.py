@@ -1,6 +1,8 @@
 """The commands that a user types, run as nerfstudio runs them on a tiny scene."""
 
 import json
+import re
+import shlex
 import shutil
 import signal
 import socket
@@ -21,7 +23,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.trainer import Trainer
 from scipy.spatial.transform import Rotation
 
-from sparsestyle_ns.coarse_run import newest_checkpoint
+from sparsestyle_ns.coarse_run import newest_checkpoint, read_coarse_run
 from sparsestyle_ns.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.effects.registry import EFFECTS
 from sparsestyle_ns.method_configs import method_config
@@ -238,12 +240,53 @@ def test_a_resumed_run_ends_as_one_that_was_never_stopped(
     assert len(set(groups)) == 1
 
 
-def test_hier_style_trains_the_coarse_run_itself_where_there_is_none(
-    llff_scene: Path, painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_ctrl_c_takes_nothing_from_the_iteration_it_comes_in(
+    llff_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """After the fifth of six iterations empty space is decided about, and the preview is due."""
+    flags = [*TINY[: TINY.index("--pipeline.effects.empty-space")], "--max-num-iterations", "6", "--previews", "0.8"]
+    ns_train("coarse-fewshot", llff_scene, tmp_path / "whole", *flags)
+    with monkeypatch.context() as patch:
+        press_ctrl_c_at(patch, step=4)
+        ns_train("coarse-fewshot", llff_scene, tmp_path / "first", *flags)
+    first, whole = (only_run(tmp_path / name, "coarse-fewshot") for name in ("first", "whole"))
+    assert [path.name for path in (first / "previews").iterdir()] == ["after-000005.png"]
+    ns_train("coarse-fewshot", llff_scene, tmp_path / "second", "--load-dir", str(first / "nerfstudio_models"), *flags)
+    ends = load(whole), load(only_run(tmp_path / "second", "coarse-fewshot"))
+    assert ends[0]["effects"] == ends[1]["effects"]
+    assert_same_state(ends[0]["pipeline"], ends[1]["pipeline"])
+
+
+def test_a_run_remembers_where_its_painting_is(
+    runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(painting.parent)
+    flags = ["--style-image", painting.name, "--coarse-run", str(runs.coarse), "--max-num-iterations", "1"]
+    ns_train("hier-style", llff_scene, tmp_path, *flags, *TINY_STYLE)
+    config = yaml.load((only_run(tmp_path, "hier-style") / "config.yml").read_text(), Loader=yaml.Loader)
+    assert config.pipeline.style_image == painting.resolve()
+
+
+def test_a_coarse_run_that_isnt_finished_is_said_to_be(runs: SimpleNamespace, tmp_path: Path) -> None:
+    assert read_coarse_run(runs.coarse).in_words() == str(runs.coarse)
+    folder = shutil.copytree(runs.coarse, tmp_path / "run")
+    config = (folder / "config.yml").read_text().replace("max_num_iterations: 3", "max_num_iterations: 30")
+    (folder / "config.yml").write_text(config)
+    assert read_coarse_run(folder).in_words() == f"{folder}, which isn't finished (3 of 30 iterations)"
+
+
+@pytest.fixture
+def short_coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Makes coarse-fewshot a method of two iterations of a narrow field."""
     coarse = method_config("coarse-fewshot")
     monkeypatch.setattr(coarse, "max_num_iterations", 2)
     monkeypatch.setattr(coarse.pipeline.model.coarse_field, "layer_width", 32)
+
+
+@pytest.mark.usefixtures("short_coarse")
+def test_hier_style_trains_the_coarse_run_itself_where_there_is_none(
+    llff_scene: Path, painting: Path, tmp_path: Path
+) -> None:
     style = ["--style-image", str(painting), "--num-views", "2", "--max-num-iterations", "2", *TINY_STYLE]
     ns_train("hier-style", llff_scene, tmp_path, *style)
     trained, stylised = only_run(tmp_path, "coarse-fewshot"), only_run(tmp_path, "hier-style")
@@ -251,6 +294,27 @@ def test_hier_style_trains_the_coarse_run_itself_where_there_is_none(
     assert config.pipeline.coarse_run == trained.resolve()
     assert json.loads((trained / "scene.json").read_text())["view_ids"] == [1, 11]
     assert load(trained)["step"] == load(stylised)["step"] == 1
+
+
+@pytest.mark.usefixtures("short_coarse")
+def test_a_coarse_run_that_ctrl_c_ends_within_hier_style_is_finished_by_the_command_it_names(
+    llff_scene: Path, painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from nerfstudio.scripts import train
+
+    style = ["--style-image", str(painting), "--num-views", "2", "--max-num-iterations", "1", *TINY_STYLE]
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as ended:
+        press_ctrl_c_at(patch, step=0)
+        ns_train("hier-style", llff_scene, tmp_path, *style)
+    (resume,) = re.findall("finish it with (ns-train .*) and run this command again", str(ended.value.code))
+    interrupted = only_run(tmp_path, "coarse-fewshot")
+    run_entrypoint(train.entrypoint, shlex.split(resume)[1:])
+    ns_train("hier-style", llff_scene, tmp_path, *style)
+    (checkpoint,) = tmp_path.glob("*/hier-style/*/nerfstudio_models/*.ckpt")
+    config = yaml.load((checkpoint.parents[1] / "config.yml").read_text(), Loader=yaml.Loader)
+    assert config.pipeline.coarse_run.parent == interrupted.resolve().parent
+    assert config.pipeline.coarse_run != interrupted.resolve()
+    assert load(config.pipeline.coarse_run)["step"] == 1
 
 
 def test_ctrl_c_leaves_a_checkpoint_that_renders(

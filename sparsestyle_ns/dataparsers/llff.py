@@ -25,6 +25,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn import functional as F
 
+from sparsestyle_ns.dataparsers.choice import advice
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.photos import check_one_size, open_photo, photo_size
 from sparsestyle_ns.rendering.ndc import ndc_rays
@@ -182,7 +183,7 @@ def read_poses_bounds(folder: Path) -> LLFFCameras:
     if not path.exists():
         raise InputError(
             f"{folder} has no poses_bounds.npy: an LLFF folder needs that file (LLFF's imgs2poses.py writes it) "
-            f"and one of images_8, images_4, images{_other_parser_hint(folder)}."
+            f"and one of images_8, images_4, images{advice(folder, path.name)}."
         )
     rows = _load_rows(path)
     matrices = rows[:, :15].reshape(-1, 3, 5)
@@ -195,15 +196,6 @@ def read_poses_bounds(folder: Path) -> LLFFCameras:
     )
     _check_cameras(cameras, path)
     return cameras
-
-
-def _other_parser_hint(folder: Path) -> str:
-    """Which dataparser reads the folder instead, if its files tell."""
-    if (folder / "transforms_train.json").exists():
-        return "; it has transforms_train.json, which blender-data reads in place of llff-data"
-    if (folder / "transforms.json").exists():
-        return "; it has transforms.json, which nerfstudio-data reads in place of llff-data"
-    return ""
 
 
 def _load_rows(path: Path) -> Float[Tensor, "num_views 17"]:

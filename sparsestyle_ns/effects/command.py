@@ -8,6 +8,7 @@ from nerfstudio.configs.dataparser_configs import all_dataparsers
 
 from sparsestyle_ns.coarse_run import check_scene, read_coarse_run
 from sparsestyle_ns.datamanager import FewShotDataManagerConfig
+from sparsestyle_ns.dataparsers.choice import check_parser
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import ALL_AUTO, decide
 from sparsestyle_ns.errors import InputError
@@ -35,8 +36,7 @@ def measure_scene(
     Raises:
         InputError: there is no such dataparser or scene, or something can't be read.
     """
-    if dataparser not in all_dataparsers:
-        raise InputError(f"There is no dataparser {dataparser}; name one of {', '.join(sorted(all_dataparsers))}.")
+    check_parser(dataparser)
     if not data.exists():
         raise InputError(f"There is no {data}; name a scene's folder with --data.")
     config = FewShotDataManagerConfig(

@@ -222,8 +222,8 @@ class Laboratory:
             ):
                 self._watch(process, log, log.stat().st_size, run)
         if process.returncode != 0 or experiment.steps_done(self.scene) < iterations:
-            last = log.read_text(errors="replace").strip().splitlines()[-1:]
-            raise InputError(f"The run {folder.name} didn't finish ({' '.join(last)}); all it said is in {log}.")
+            words = last_words(log.read_text(errors="replace"))
+            raise InputError(f"The run {folder.name} didn't finish ({words}); all it said is in {log}.")
         seconds = time.monotonic() - start
         self.say(f"{folder.name}: {iterations - done} iterations in {duration(seconds)}")
         self._record(folder / SECONDS_FILE, seconds, iterations - done)
@@ -246,6 +246,15 @@ class Laboratory:
         before = json.loads(path.read_text()) if path.is_file() else {"seconds": 0.0, "iterations": 0}
         record = {"seconds": before["seconds"] + seconds, "iterations": before["iterations"] + iterations}
         path.write_text(json.dumps(record) + "\n")
+
+
+def last_words(log: str) -> str:
+    """The last line of a log, or all that the last box says where it ends with one, as a wrong flag's does."""
+    lines = log.strip().splitlines() or [""]
+    if not lines[-1].startswith("╰"):
+        return lines[-1]
+    start = max((number for number, line in enumerate(lines) if line.startswith("╭")), default=0)
+    return " ".join(" ".join(line.strip("╭╮╰╯│─ ") for line in lines[start:]).split())
 
 
 def share_done(log: str) -> Optional[float]:

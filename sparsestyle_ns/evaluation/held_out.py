@@ -5,7 +5,7 @@ import statistics
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Dict, List, Optional
+from typing import Any, Dict, List, Optional, Sequence
 
 import torch
 from jaxtyping import Float
@@ -52,10 +52,9 @@ class HeldOutReport:
     seconds: List[float]
 
     def deviations(self) -> Dict[str, float]:
-        """As `…_std`, the standard deviations between views; nothing where there is one view."""
-        if len(self.views) < 2:
-            return {}
-        return {f"{key}_std": statistics.stdev(view[key] for view in self.views) for key in self.views[0]}
+        """As `…_std`, the standard deviations between views; nothing of what fewer than two views have."""
+        found = by_figure(self.views)
+        return {f"{key}_std": statistics.stdev(values) for key, values in found.items() if len(values) > 1}
 
     def speed(self) -> Dict[str, float]:
         """`num_rays_per_sec` and `fps`, means over the views."""
@@ -75,6 +74,12 @@ class HeldOutReport:
             "views": self.views,
         }
         write_whole(path, json.dumps(content, indent=2) + "\n")
+
+
+def by_figure(views: Sequence[Dict[str, float]]) -> Dict[str, List[float]]:
+    """Each figure's values, of the views that have it."""
+    names = dict.fromkeys(name for view in views for name in view)
+    return {name: [view[name] for view in views if name in view] for name in names}
 
 
 @dataclass
@@ -131,7 +136,8 @@ def evaluate_held_out(
         rays.append(photo.shape[0] * photo.shape[1])
         if isinstance(model, CoarseFewShotModel):
             values = image_metrics(outputs["rgb"], photo)
-            values["effective_samples"] = mean_effective_samples(model, camera)
+            effective = mean_effective_samples(model, camera)
+            values.update({} if effective is None else {"effective_samples": effective})
         else:
             values = {f"coarse_{key}": value for key, value in image_metrics(outputs["rgb_coarse"], photo).items()}
             values["content_ssim"] = image_metrics(outputs["rgb"], photo)["ssim"]
@@ -149,7 +155,7 @@ def evaluate_held_out(
             for name, picture in pictures.items():
                 save_image(picture.permute(2, 0, 1).cpu(), picture_folder / f"eval_{name}_{index:04d}.png")
         views.append(values)
-    means = {key: sum(view[key] for view in views) / len(views) for key in views[0]}
+    means = {key: sum(values) / len(values) for key, values in by_figure(views).items()}
     training_cameras = pipeline.datamanager.train_dataset.cameras
     if isinstance(model, HierStyleModel) and len(training_cameras) > 1:
         means.update(render_path(model, measuring_path(training_cameras)).figures())
@@ -188,8 +194,11 @@ def stylisation_figures(
 
 
 @torch.no_grad()
-def mean_effective_samples(model: CoarseFewShotModel, camera: Any) -> float:
-    """Mean of `effective_samples` over a view's rays that meet a surface, on `EVEN_SAMPLES` even samples."""
+def mean_effective_samples(model: CoarseFewShotModel, camera: Any) -> Optional[float]:
+    """Mean of `effective_samples` over a view's rays that meet a surface, on `EVEN_SAMPLES` even samples.
+
+    None where no ray does: JSON has no word for a mean of nothing.
+    """
     rays = camera.generate_rays(camera_indices=0, keep_shape=False).flatten()
     counts = []
     for start in range(0, len(rays), model.config.eval_num_rays_per_chunk):
@@ -200,7 +209,8 @@ def mean_effective_samples(model: CoarseFewShotModel, camera: Any) -> float:
             density, _ = model.field.density_and_feature(segments.positions(0.5 * (edges[:, 1:] + edges[:, :-1])))
         weights = dense_weights(optical_depth(density, interval_lengths(segments, edges, model.space.unbounded)))
         counts.append(effective_samples(weights)[weights.sum(dim=-1) > MIN_ACCUMULATION])
-    return float(torch.cat(counts).mean())
+    found = torch.cat(counts)
+    return float(found.mean()) if len(found) else None
 
 
 def evaluate_run(

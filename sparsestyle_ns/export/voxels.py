@@ -9,15 +9,25 @@ from dataclasses import dataclass
 from typing import Sequence
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 from torch.nn import functional as F
 
 from sparsestyle_ns.models.hier_style import RAYS_PER_CALL, HierStyleModel
 from sparsestyle_ns.progress import track
-from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT, SIDE, Rays, render_baked
+from sparsestyle_ns.rendering.baked import (
+    DENSITY_STEP,
+    DENSITY_UNIT,
+    SIDE,
+    BakedVolume,
+    Rays,
+    decode,
+    encode,
+    render_baked,
+)
 from sparsestyle_ns.rendering.density_grid import Occupancy, march
+from sparsestyle_ns.rendering.mixing import Appearance, Mix, mixed
 from sparsestyle_ns.rendering.space import ForwardFacingSpace, Segments
 from sparsestyle_ns.rendering.volume import render_packed
 
@@ -52,7 +62,7 @@ class Voxels:
 
 @torch.no_grad()
 def bake_voxels(model: HierStyleModel, resolution: int, cameras: Sequence[Cameras]) -> Voxels:
-    """Evaluates a model's fields wherever one of some cameras may see them.
+    """Evaluates a model's fields wherever one of some cameras may see them, mixed as its pictures show them.
 
     That is in bricks of 8³ cells that their rays reach before 99.9% of the light is gone, in cells that aren't empty.
 
@@ -70,18 +80,32 @@ def bake_voxels(model: HierStyleModel, resolution: int, cameras: Sequence[Camera
             segments = model.space.segments(origins, directions)
             rays = Rays(segments, model.occupancy, config.num_steps, model.space.unbounded, config.min_transmittance)
             render_baked(volume, rays, model.background)
+    filled = torch.ones(1, 1, 1, dtype=torch.bool, device=model.device)  # where nothing is known to be empty
+    if model.occupancy is not None:
+        filled = model.occupancy.occupied
     seen = (volume.slots > 0).float()
     for axis in range(3):
         seen = seen.repeat_interleave(SIDE, dim=axis).narrow(axis, 0, resolution)
-    occupied = F.adaptive_max_pool3d(model.occupancy.occupied.float()[None], resolution)[0] > 0
+    occupied = F.adaptive_max_pool3d(filled.float()[None], resolution)[0] > 0
     cells = (seen > 0) & (occupied | last_step_cells(model, resolution))
     for part in track(cells.nonzero().split(CELLS_PER_CALL), "Baking"):
         volume.fill(part)
     known = F.max_pool3d(F.pad(cells.float()[None], (1,) * 6), kernel_size=2, stride=1)[0] > 0
     codes = torch.zeros(*known.shape, 4, dtype=torch.uint8, device=known.device)
     codes[..., 0] = EMPTY
-    codes[known] = volume.codes.view(-1, 8)[volume.rows(known.nonzero()), STYLISED]
-    return Voxels(codes.cpu(), known.cpu(), model.occupancy.occupied.cpu())
+    index = known.nonzero()
+    codes[known] = torch.cat([shown_codes(volume, part, model.look.mix) for part in index.split(CELLS_PER_CALL)])
+    return Voxels(codes.cpu(), known.cpu(), filled.cpu())
+
+
+def shown_codes(volume: BakedVolume, voxels: Int[Tensor, "voxels 3"], mix: Mix) -> UInt8[Tensor, "voxels 4"]:
+    """Codes of the density and colour that a mixture of the fields shows: by default those of σ_f and c_f."""
+    codes = volume.codes.view(-1, 8)[volume.rows(voxels)]
+    if mix == Mix():
+        return codes[:, STYLISED]
+    values = decode(codes.float())
+    density, color = mixed(Appearance(values[:, 0], values[:, 5:]), [Appearance(values[:, 1], values[:, 2:5])], mix)
+    return encode(torch.cat([density[:, None], density[:, None], color, color], dim=-1))[:, STYLISED]
 
 
 def last_step_cells(model: HierStyleModel, resolution: int) -> Bool[Tensor, "x y z"]:

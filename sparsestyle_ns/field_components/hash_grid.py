@@ -89,7 +89,8 @@ class _GatherSum(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, table: Tensor, corners: Corners) -> Tensor:
-        ctx.corners, ctx.rows = corners, len(table)
+        ctx.save_for_backward(*corners)  # an attribute would outlive a checkpointed chunk's forward pass
+        ctx.rows = len(table)
         points, levels, count = corners.rows.shape
         bags = (points * levels, count)
         weights = corners.weights.to(table.dtype).reshape(bags)
@@ -98,7 +99,7 @@ class _GatherSum(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> Tuple[Tensor, None]:
-        rows, weights = ctx.corners
+        rows, weights = ctx.saved_tensors
         bags = grad.reshape(rows.shape[0] * rows.shape[1], 1, grad.shape[-1] // rows.shape[1])
         parts = weights.to(grad.dtype).reshape(-1, 8, 1) * bags
         table_grad = grad.new_zeros(ctx.rows, parts.shape[-1])
@@ -132,13 +133,15 @@ class _Fused(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, table: Tensor, positions: Tensor, resolutions: Tuple[int, ...], kernels: ModuleType) -> Tensor:
-        ctx.positions, ctx.resolutions, ctx.kernels, ctx.shape = positions, resolutions, kernels, table.shape
+        ctx.save_for_backward(positions)
+        ctx.resolutions, ctx.kernels, ctx.shape = resolutions, kernels, table.shape
         return kernels.gather(table.view(len(resolutions), -1, table.shape[-1]), positions, resolutions)
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> Tuple[Tensor, None, None, None]:
         levels = (len(ctx.resolutions), ctx.shape[0] // len(ctx.resolutions), ctx.shape[1])
-        table_grad = ctx.kernels.scatter(grad, ctx.positions, ctx.resolutions, levels)
+        (positions,) = ctx.saved_tensors
+        table_grad = ctx.kernels.scatter(grad, positions, ctx.resolutions, levels)
         return table_grad.view(ctx.shape), None, None, None
 
 

@@ -14,7 +14,7 @@ from sparsestyle_ns.evaluation.tables import report_tables
 from sparsestyle_ns.gallery.film import as_pixels, make_film
 from sparsestyle_ns.gallery.page import Picture, RunPictures, View, read_film
 from sparsestyle_ns.page import Pixels
-from sparsestyle_ns.photos import PhotoDataset
+from sparsestyle_ns.photos import PhotoDataset, at_size
 from sparsestyle_ns.progress import track
 from sparsestyle_ns.run_folder import REPORT_FILE, STYLE_METHOD, find_config, load_run
 from sparsestyle_ns.style.image import load_style_image
@@ -82,9 +82,9 @@ def _render_views(pipeline: Any, dataset: PhotoDataset, num_views: int) -> Tuple
         path = dataset.image_filenames[index]
         photo = _photo(originals, index)
         height, width = photo.shape[:2]
-        camera = dataset.cameras[index : index + 1].to(pipeline.device)
-        camera.rescale_output_resolution(width / camera.width.item())
-        camera.height.fill_(height)
+        camera = at_size(originals.cameras[index : index + 1], *torch.tensor([width, height]).view(2, 1, 1))
+        camera = camera.to(pipeline.device)
+        camera.distortion_params = dataset.cameras[index : index + 1].distortion_params
         with torch.no_grad():
             outputs = exact_outputs(pipeline.model, camera)
             metrics, _ = pipeline.model.get_image_metrics_and_images(

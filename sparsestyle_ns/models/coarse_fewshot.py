@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.field_components.positional_encoding import revealed_levels
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
@@ -105,6 +106,9 @@ class CoarseFewShotModel(Model):
     def populate_modules(self) -> None:
         """Builds the field, the space, and what the scene's effects need."""
         super().populate_modules()
+        if not 0.0 < self.config.even_share <= 1.0:
+            share = self.config.even_share
+            raise InputError(f"--pipeline.model.even-share is {share}; give a number above 0 and up to 1.")
         metadata: Dict[str, Any] = self.kwargs["metadata"]
         effects: Decisions = metadata["effects"]
         self.space = effects.build_space(scene_box=self.scene_box, metadata=metadata)

@@ -23,7 +23,7 @@ from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
 from sparsestyle_ns.processes import average_gradients, num_processes, own_share, put_together
-from sparsestyle_ns.progress import bar, track
+from sparsestyle_ns.progress import bar, say, track
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.volume import accumulation_of, seen_behind
 from sparsestyle_ns.schedules import content_weight
@@ -79,9 +79,9 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         """Makes sure, before hours of training, that the style image and the feature network can be loaded.
 
         Raises:
-            InputError: they can't.
+            InputError: see `load_targets`.
         """
-        self.load_targets(torch.device("cpu"))
+        self._load_style()
 
     def load_targets(self, device: torch.device) -> StyleTargets:
         """The painting as the feature network sees it.
@@ -89,12 +89,15 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         Raises:
             InputError: there is no style image or no weights, or they can't be read; style_features is below 1.
         """
+        image, backbone = self._load_style()
+        return self.targets_of(image.to(device), backbone.to(device))
+
+    def _load_style(self) -> Tuple[Float[Tensor, "3 H W"], VGGFeatures]:
         if self.style_image is None:
             raise InputError("There is no style image: name a painting with --style-image FILE.")
         if self.style_features is not None and self.style_features < 1:
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
-        image = load_style_image(self.style_image)
-        return self.targets_of(image.to(device), load_backbone(self.backbone, self.vgg_weights).to(device))
+        return load_style_image(self.style_image), load_backbone(self.backbone, self.vgg_weights)
 
     def targets_of(self, image: Float[Tensor, "3 H W"], backbone: VGGFeatures) -> StyleTargets:
         """A painting as a feature network on its device sees it, with these settings."""
@@ -210,9 +213,13 @@ class HierStylePipeline(CheckedPipeline):
 
     def painting(self) -> Optional[StyleTargets]:
         """See `CheckedPipeline.painting`."""
-        if self.targets is None and self.config.style_image is not None and self.config.style_image.is_file():
-            return self.config.load_targets(self.device)
-        return self.targets
+        if self.targets is not None:
+            return self.targets
+        path = self.config.style_image
+        if path is None or not path.is_file():
+            say(f"The painting {path} isn't there any more, so nothing is measured against it.")
+            return None
+        return self.config.load_targets(self.device)
 
     def prepare_style(self) -> None:
         """Loads the painting and the feature network."""

@@ -1,6 +1,5 @@
 """Volume rendering of the two fields: segments and fields in, pixels out."""
 
-import math
 from dataclasses import dataclass
 from typing import List, Optional, Sequence, Tuple
 
@@ -16,7 +15,6 @@ from sparsestyle_ns.rendering.compositing import (
     dense_weights,
     optical_depth,
     packed_sum,
-    packed_transmittance,
     packed_weights,
 )
 from sparsestyle_ns.rendering.density_grid import Occupancy, PackedSamples, interval_lengths, march
@@ -166,24 +164,23 @@ def visible_samples(
     Samples lie in occupied cells, where a grid says which are, and in front of them at least `min_transmittance` of the
     light is left.
     """
-    num_rays = len(segments.hit)
     samples = march(segments, occupancy, num_steps, unbounded)
-    opaque_depth = -math.log(min_transmittance) if min_transmittance > 0 else math.inf
-    index, density, feature = evaluate_front_to_back(field, samples, num_rays, opaque_depth)
-    samples = samples.select(index)
-    depth = optical_depth(density, samples.lengths)
-    seen = packed_transmittance(depth, samples.ray_indices, num_rays) > min_transmittance
-    return samples.select(seen), density[seen], feature[seen]
+    index, density, feature = evaluate_front_to_back(field, samples, len(segments.hit), min_transmittance)
+    return samples.select(index), density, feature
 
 
 def evaluate_front_to_back(
-    field: CoarseField, samples: PackedSamples, num_rays: int, opaque_depth: float
-) -> Tuple[Int[Tensor, "evaluated"], Float[Tensor, "evaluated"], Float[Tensor, "evaluated feature"]]:
-    """σ_c and e_c of packed samples, a few from each ray at a time, until its optical depth reaches `opaque_depth`.
+    field: CoarseField, samples: PackedSamples, num_rays: int, min_transmittance: float
+) -> Tuple[Int[Tensor, "seen"], Float[Tensor, "seen"], Float[Tensor, "seen feature"]]:
+    """σ_c and e_c of those packed samples in front of which more than `min_transmittance` of the light is left.
+
+    A few samples of each ray are evaluated at a time, and none of a ray that has ended.
+
+    The same samples come out each time, on a GPU too: a view that is frozen again in the backward pass has to have
+    them. So depths aren't added up by threads that race, as `index_add_` and sums over all samples are there.
 
     Returns:
-        Which samples were evaluated, ascending, and σ_c and e_c there. All samples in front of that depth are among
-        them.
+        Which samples these are, ascending, and σ_c and e_c there.
     """
     on_ray = samples.ray_indices
     counts = torch.bincount(on_ray, minlength=num_rays)
@@ -191,11 +188,18 @@ def evaluate_front_to_back(
     depth = samples.s.new_zeros(num_rays)
     found: List[Tuple[Tensor, Tensor, Tensor]] = []
     for first in range(0, max(1, int(counts.max())), SAMPLES_PER_PASS):
-        in_pass = (rank >= first) & (rank < first + SAMPLES_PER_PASS) & (depth < opaque_depth)[on_ray]
+        goes_on = torch.exp(-depth) > min_transmittance
+        in_pass = (rank >= first) & (rank < first + SAMPLES_PER_PASS) & goes_on[on_ray]
         index = in_pass.nonzero().squeeze(-1)
         density, feature = field.density_and_feature(samples.positions[index])
-        depth.index_add_(0, on_ray[index], optical_depth(density, samples.lengths[index]))
-        found.append((index, density, feature.float()))
+        place = on_ray[index], rank[index] - first
+        depths = depth.new_zeros(num_rays, SAMPLES_PER_PASS)
+        depths[place] = optical_depth(density, samples.lengths[index])
+        behind = depth[:, None] + depths.cumsum(dim=1)
+        in_front = torch.cat([depth[:, None], behind[:, :-1]], dim=1)
+        seen = torch.exp(-in_front)[place] > min_transmittance
+        depth = behind[:, -1]
+        found.append((index[seen], density[seen], feature[seen].float()))
     index, density, feature = (torch.cat(parts) for parts in zip(*found, strict=True))
     order = torch.argsort(index)
     return index[order], density[order], feature[order]

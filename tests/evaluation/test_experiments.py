@@ -13,6 +13,7 @@ from sparsestyle_ns.evaluation.experiments import (
     Experiment,
     Laboratory,
     SceneSettings,
+    last_words,
     share_done,
 )
 
@@ -134,6 +135,13 @@ def test_a_run_that_fails_is_named_with_its_log(laboratory: Laboratory, monkeypa
     monkeypatch.setattr(Experiment, "command", lambda *_: fail)
     with pytest.raises(InputError, match=r"ours-[0-9a-f]{8} didn't finish \(Error: the scene is gone\).*\.log"):
         laboratory.run([COARSE])
+
+
+def test_of_a_flag_that_doesnt_exist_the_words_are_told_and_not_the_box_around_them() -> None:
+    box = "╭─ Unrecognized options ─────╮\n│ Unrecognized options: --foo │\n│ ─────── │\n│ Run it --help │\n╰──────╯\n"
+    assert last_words("before\n" + box) == "Unrecognized options Unrecognized options: --foo Run it --help"
+    assert last_words(box + "Error: the scene is gone\n") == "Error: the scene is gone"
+    assert last_words("") == ""
 
 
 def test_after_ctrl_c_nothing_more_is_begun(laboratory: Laboratory, monkeypatch: pytest.MonkeyPatch) -> None:

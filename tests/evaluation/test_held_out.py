@@ -4,12 +4,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 from conftest import run_entrypoint
 
 from sparsestyle_ns.cli import main
-from sparsestyle_ns.evaluation.held_out import evaluate_run, saved_report
+from sparsestyle_ns.evaluation.held_out import by_figure, evaluate_held_out, evaluate_run, saved_report
 from sparsestyle_ns.evaluation.tables import report_tables
-from sparsestyle_ns.run_folder import find_config
+from sparsestyle_ns.run_folder import find_config, load_run
 
 
 def test_baked_renders_are_held_against_exact_ones_when_asked_for(runs: SimpleNamespace, tmp_path: Path) -> None:
@@ -23,6 +24,19 @@ def test_baked_renders_are_held_against_exact_ones_when_asked_for(runs: SimpleNa
 
 def test_a_coarse_run_has_nothing_to_bake(runs: SimpleNamespace, tmp_path: Path) -> None:
     assert "baked_psnr" not in evaluate_run(find_config(runs.coarse), tmp_path / "coarse.json", baked=True).means
+
+
+def test_a_view_that_shows_no_surface_has_no_sharpness_and_the_report_is_json(runs: SimpleNamespace) -> None:
+    _, pipeline, _ = load_run(find_config(runs.coarse))
+    with torch.no_grad():
+        pipeline.model.field.density_head.weight.zero_()
+        pipeline.model.field.density_head.bias.fill_(-20.0)
+    pipeline.model.space.unbounded = False
+    report = evaluate_held_out(pipeline)
+    assert "psnr" in report.means and "effective_samples" not in report.means
+    json.dumps(report.means, allow_nan=False)
+    assert by_figure([{"a": 1.0, "b": 2.0}, {"a": 3.0}]) == {"a": [1.0, 3.0], "b": [2.0]}
+    assert "effective_samples_std" not in report.deviations() and "psnr_std" in report.deviations()
 
 
 def test_a_stylised_run_is_measured_for_truth_consistency_style_and_content(runs: SimpleNamespace) -> None:
@@ -52,13 +66,16 @@ def test_ns_eval_gives_the_same_figures(runs: SimpleNamespace, tmp_path: Path) -
         assert all(f"{key}_std" in found for key in ("psnr", "ssim") if key in found)
 
 
-def test_a_run_whose_painting_is_gone_is_measured_without_the_style(runs: SimpleNamespace, tmp_path: Path) -> None:
+def test_a_run_whose_painting_is_gone_is_measured_without_the_style_and_says_so(
+    runs: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     text = (runs.style / "config.yml").read_text()
     moved = tmp_path / "scene" / "hier-style" / "run"
     shutil.copytree(runs.style, moved)
     (moved / "config.yml").write_text(text.replace("painting.png", "gone.png"))
     means = evaluate_run(find_config(moved), tmp_path / "report.json").means
     assert "style_loss" not in means and "gram_distance" not in means
+    assert "gone.png isn't there any more, so nothing is measured against it." in capsys.readouterr().out
     assert "short_rmse" in means and "coarse_psnr" in means
 
 

@@ -242,6 +242,7 @@ def test_annealing_is_plotted_as_the_way_of_both_losses_and_each_by_iteration() 
     [
         (("--data", "{tmp}/gone"), "Error: There is no scene at --data {tmp}/gone"),
         (("--jobs", "0"), "Error: --jobs is 0"),
+        (("--parser", "llf-data"), "Error: There is no dataparser llf-data; name one of "),
         (("--output-path", "{tmp}"), "Error: --output-path {tmp} is a folder"),
     ],
 )

@@ -1,6 +1,7 @@
 """Voxels stand for the fields wherever a page's camera may look."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,9 +9,11 @@ from small_scenes import KINDS, NUM_STEPS, balls, psnr, scene
 
 from sparsestyle_ns.evaluation.held_out import exact_outputs
 from sparsestyle_ns.export.command import load_scene, median_depth, page_picture
-from sparsestyle_ns.export.orbit import make_orbit, survey, turned
+from sparsestyle_ns.export.orbit import make_orbit, resized, survey, turned
 from sparsestyle_ns.export.voxels import Voxels, bake_voxels, interpolate, last_step_cells, render_voxels
 from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT
+from sparsestyle_ns.rendering.density_grid import Occupancy
+from sparsestyle_ns.rendering.mixing import Mix
 
 
 def test_interpolation_is_exact_for_what_is_linear():
@@ -108,3 +111,28 @@ def test_voxels_hold_the_fields_values(exported):
     torch.testing.assert_close(
         voxels.codes[tuple(index.unbind(-1))][:, 1:] / 255.0, shade[:, 2:5], atol=0.6 / 255, rtol=0
     )
+
+
+def test_where_no_empty_space_is_skipped_every_cell_counts(exported):
+    """As for a run with `--pipeline.effects.empty-space off`."""
+    loaded, _, _ = exported
+    camera, before, baked = resized(loaded.cameras[1:2], 16), loaded.model.occupancy, []
+    for occupancy in (None, Occupancy(4)):
+        loaded.model.occupancy = occupancy
+        baked.append(bake_voxels(loaded.model, 32, [camera]))
+    loaded.model.occupancy = before
+    without, everywhere = baked
+    assert without.occupied.all()
+    assert torch.equal(without.known, everywhere.known) and without.known.any()
+    assert torch.equal(without.codes, everywhere.codes)
+
+
+@pytest.mark.parametrize("mix", [Mix(0.0), Mix(0.5, 0.3)])
+def test_a_run_whose_config_asks_for_less_of_the_style_is_exported_so(exported, mix):
+    loaded, _, _ = exported
+    camera, before = loaded.cameras[1:2], loaded.model.look
+    loaded.model.look = replace(before, mix=mix)
+    voxels, exact = bake_voxels(loaded.model, 95, [camera]), exact_outputs(loaded.model, camera)["rgb"]
+    loaded.model.look = before
+    assert psnr(page_picture(voxels, loaded.model, camera), exact) > 33
+    assert psnr(exact, exact_outputs(loaded.model, camera)["rgb"]) < 30

@@ -2,11 +2,13 @@ import math
 import os
 import subprocess
 import sys
+import weakref
 
 import pytest
 import reference
 import torch
 from nerfstudio.field_components.encodings import HashEncoding
+from torch.utils.checkpoint import checkpoint
 
 from sparsestyle_ns.field_components.hash_grid import (
     HashGrid,
@@ -242,6 +244,24 @@ def test_the_gradient_may_come_in_any_layout(points):
     (broadcast,) = torch.autograd.grad(grid(points).sum(), grid.table)
     (written_out,) = torch.autograd.grad((grid(points) * torch.ones(POINTS, grid.get_out_dim())).sum(), grid.table)
     assert torch.equal(broadcast, written_out)
+
+
+@pytest.mark.parametrize("with_kernels", [True, False])
+def test_of_a_checkpointed_chunk_nothing_is_kept_until_the_backward_pass(with_kernels, monkeypatch, points):
+    if not with_kernels:
+        monkeypatch.setattr("sparsestyle_ns.field_components.hash_grid.fused_kernels", lambda device: None)
+    grid, located = small_grid(), []
+
+    def encode():
+        location = grid.locate(points)
+        located.extend(map(weakref.ref, (location.positions, *(location.corners or ()))))
+        return grid.interpolate(location)
+
+    encoded = checkpoint(encode, use_reentrant=False)
+    assert len(located) == (1 if with_kernels else 3)
+    assert all(reference() is None for reference in located)
+    expected = torch.autograd.grad(grid(points).square().sum(), grid.table)[0]
+    torch.testing.assert_close(torch.autograd.grad(encoded.square().sum(), grid.table)[0], expected)
 
 
 def test_the_memory_of_a_location_counts_all_of_its_parts(points):

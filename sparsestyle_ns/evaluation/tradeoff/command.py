@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
 from rich.progress_bar import ProgressBar
 
+from sparsestyle_ns.dataparsers.choice import MARKERS, marker_of
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.machine import device_name, versions
 from sparsestyle_ns.evaluation.tradeoff.axis import Axis
@@ -33,12 +34,6 @@ REPORT_SHARE = 0.05
 """Time that is kept for writing the report: so many seconds, but no larger part of the budget."""
 REFRESHES = 2
 """Of the progress bar in a second; drawing it takes time from what is measured."""
-MARKERS = {
-    "poses_bounds.npy": "llff-data",
-    "transforms_train.json": "blender-data",
-    "transforms.json": "nerfstudio-data",
-}
-"""What a scene's folder has in it, and which dataparser reads it."""
 
 
 def parse_dataparser(arguments: Sequence[str], data: Path) -> Any:
@@ -50,12 +45,12 @@ def parse_dataparser(arguments: Sequence[str], data: Path) -> Any:
     if not data.exists():
         raise InputError(f"There is no {data}; name a scene's folder with --data.")
     if not arguments:
-        found = [parser for marker, parser in MARKERS.items() if (data / marker).is_file()]
-        if not found:
+        marker = marker_of(data)
+        if marker is None:
             raise InputError(
                 f"{data} has none of {', '.join(MARKERS)}, so the dataparser isn't known; name it last, such as colmap."
             )
-        arguments = found[:1]
+        arguments = [MARKERS[marker]]
     return tyro.cli(AnnotatedDataParserUnion, args=list(arguments), prog="sparsestyle tradeoff")
 
 
