@@ -35,6 +35,12 @@ def nnfm_loss(features, style_features):
     return sum(distances) / len(distances)
 
 
+def semantic_loss(maps, target_maps):
+    """1 − cos of the means of two feature maps [C][h][w] over their places."""
+    means = [[sum(map(sum, channel)) / sum(map(len, channel)) for channel in each] for each in (maps, target_maps)]
+    return 1 - cosine(*means)
+
+
 def content_loss(features, target):
     """Σ (f − f*)² / Σ f*²."""
     pairs = list(zip(features.flatten().tolist(), target.flatten().tolist(), strict=True))

@@ -25,28 +25,32 @@ from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.progress import track
 from sparsestyle_ns.run_folder import REPORT_FILE, load_run
 from sparsestyle_ns.style.targets import StyleTargets
+from sparsestyle_ns.style.vgg import can_load_backbone
 
 HIGH_FREQUENCIES = (
     *("--pipeline.model.coarse-field.num-levels", "10"),
     *("--pipeline.model.distortion-weight", "0"),
 )
+VANILLA = (*HIGH_FREQUENCIES, "--pipeline.model.coarse-field.num-layers", "8")
 COARSE_KINDS: Dict[str, Tuple[str, ...]] = {
     "ours": (),
     "paper": ("--pipeline.model.distortion-weight", "0"),
-    "vanilla": (*HIGH_FREQUENCIES, "--pipeline.model.coarse-field.num-layers", "8"),
+    "vanilla": VANILLA,
+    "dietnerf": (*VANILLA, "--pipeline.semantic-weight", "0.1"),
     "freenerf": (
         *HIGH_FREQUENCIES,
         *("--pipeline.model.frequency-reveal", "0.9"),
         *("--pipeline.model.occlusion-weight", "0.01"),
     ),
 }
-"""Stage 1: as it is; as the paper writes it, on colours alone; NeRF's ten octaves, eight layers, view dependence; and
-ten octaves with FreeNeRF's regularisers."""
+"""Stage 1: as it is; as the paper writes it, on colours alone; NeRF's ten octaves, eight layers, view dependence; the
+same with a semantic loss of DietNeRF's kind; and ten octaves with FreeNeRF's regularisers."""
 COLORS_ALONE = ("--pipeline.effects.view-color", "on", "--pipeline.effects.matched-depth", "off")
 SCENE_KINDS: Dict[str, Tuple[str, ...]] = {
     "ours": (),
     "paper": COLORS_ALONE,
     "vanilla": COLORS_ALONE,
+    "dietnerf": COLORS_ALONE,
     "freenerf": COLORS_ALONE,
 }
 """What both stages have to be told of a kind of stage 1."""
@@ -100,6 +104,12 @@ class Study:
     style_flags: Tuple[str, ...] = ()
     coarse_iterations: Optional[int] = None
     style_iterations: Optional[int] = None
+
+    def coarse_kinds(self) -> Tuple[str, ...]:
+        """The kinds of stage 1 that can be trained here: without weights of a feature network, not `dietnerf`."""
+        names_weights = any("vgg-weights" in flag.replace("_", "-") for flag in self.coarse_flags)
+        found = names_weights or can_load_backbone()
+        return tuple(kind for kind in COARSE_KINDS if found or kind != "dietnerf")
 
     def coarse(self, kind: str) -> Experiment:
         """The experiment of stage 1 of a kind."""
