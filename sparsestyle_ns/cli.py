@@ -78,8 +78,9 @@ def evaluate(
     """Measures a run on the views it hasn't seen.
 
     Coarse: PSNR, SSIM, LPIPS where its weights are on the machine, ST-LPIPS, and effective samples a ray. Stylised: the
-    coarse field's quality; style strength and what is kept of the content; and short- and long-range consistency on a
-    path of cameras between the training views, beside that of the unstylised scene.
+    coarse field's quality; style strength and what is kept of the content, with ArtFID where its weights are on the
+    machine; and short- and long-range consistency on a path of cameras between the training views, beside that of the
+    unstylised scene.
 
     Args:
         run: The run's folder or its config.yml.

@@ -70,6 +70,22 @@ def palette_transform(content_mean, content_covariance, style_mean, style_covari
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# evaluation
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def frechet_distance(first, second):
+    """FID by SciPy's general matrix square root; both covariances must be regular."""
+    means, covariances = [], []
+    for sample in (first, second):
+        means.append(sum(np.array(row) for row in sample.tolist()) / len(sample))
+        differences = [np.array(row) - means[-1] for row in sample.tolist()]
+        covariances.append(sum(np.outer(row, row) for row in differences) / (len(sample) - 1))
+    root = scipy.linalg.sqrtm(covariances[0] @ covariances[1])
+    return float(np.sum((means[0] - means[1]) ** 2) + np.trace(covariances[0] + covariances[1] - 2 * root).real)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 # schedule
 # ---------------------------------------------------------------------------------------------------------------------
 

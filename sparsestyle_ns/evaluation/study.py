@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 
 from sparsestyle_ns.coarse_run import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.evaluation.art_fid import ArtFID, missing_weights
 from sparsestyle_ns.evaluation.camera_path import measuring_path
 from sparsestyle_ns.evaluation.experiments import Experiment, SceneSettings
 from sparsestyle_ns.evaluation.held_out import evaluate_run, saved_report, stylisation_figures
@@ -157,7 +158,7 @@ class Painter:
         self._gram: Optional[torch.Tensor] = None
 
     def figures(self, frames: PathFrames, settings: Any) -> Dict[str, float]:
-        """Style strength and content kept, means over every `STYLE_EVERY`th frame.
+        """Style strength and content kept, means over every `STYLE_EVERY`th frame, and ArtFID of all of these.
 
         Args:
             frames: the frames.
@@ -166,14 +167,17 @@ class Painter:
         if self._targets is None:
             self._targets = replace(settings, style_image=self.painting).load_targets(torch.device("cpu"))
             self._gram = gram_matrix(self._targets.style_rows())
-        values = []
+        values, art_fid = [], ArtFID.against(self._targets.style_image)
         for index in track(range(0, len(frames.stylised), STYLE_EVERY), "Style and content"):
             stylised, coarse = frames.stylised[index], frames.coarse[index]
             figures = stylisation_figures(
                 self._targets, self._gram, coarse, stylised, frames.surfaces[index].covered.float()
             )
             values.append({**figures, "content_ssim": image_metrics(stylised, coarse)["ssim"]})
-        return {key: sum(value[key] for value in values) / len(values) for key in values[0]}
+            if art_fid is not None:
+                art_fid.add(stylised, coarse)
+        means = {key: sum(value[key] for value in values) / len(values) for key in values[0]}
+        return means | ({} if art_fid is None else art_fid.figures())
 
 
 def measure_run(folder: Path, painter: Painter) -> Measured:
@@ -239,7 +243,9 @@ def _measure(folder: Path, step: int, frames: PathFrames, painter: Painter, sett
 def _read(folder: Path, step: int) -> Optional[Measured]:
     path = folder / "figures.json"
     content = json.loads(path.read_text()) if path.is_file() else {"step": None}
-    return Measured(content["figures"], *_pictures(folder)) if content["step"] == step else None
+    if content["step"] != step or not ("art_fid" in content["figures"] or missing_weights()):
+        return None
+    return Measured(content["figures"], *_pictures(folder))
 
 
 def _pictures(folder: Path) -> Tuple[List[Path], List[Path]]:
