@@ -78,8 +78,9 @@ def evaluate(
     """Measures a run on the views it hasn't seen.
 
     Coarse: PSNR, SSIM, LPIPS where its weights are on the machine, ST-LPIPS, and effective samples a ray. Stylised: the
-    coarse field's quality; style strength and what is kept of the content; and short- and long-range consistency on a
-    path of cameras between the training views, beside that of the unstylised scene.
+    coarse field's quality; style strength and what is kept of the content, with ArtFID where its weights are on the
+    machine; and short- and long-range consistency on a path of cameras between the training views, beside that of the
+    unstylised scene.
 
     Args:
         run: The run's folder or its config.yml.
@@ -258,8 +259,9 @@ def compare(options: Annotated[StudyOptions, tyro.conf.arg(name="")]) -> None:
 def ablate(options: Annotated[StudyOptions, tyro.conf.arg(name="")]) -> None:
     """Runs the paper's ablations on a scene, and sets them out on one page.
 
-    Stage 1 as ours, as the paper writes it, as vanilla NeRF and with FreeNeRF's regularisers, each with our stage 2 and
-    fine-tuned; stage 2 on e_c alone, with sines and cosines, without residual density, with constant content weights.
+    Stage 1 as ours, as the paper writes it, as vanilla NeRF, with a semantic loss of DietNeRF's kind and with
+    FreeNeRF's regularisers, each with our stage 2 and fine-tuned; stage 2 on e_c alone, with sines and cosines,
+    without residual density, with constant content weights.
     Interrupted, the same command goes on where it was; runs that `compare` has made are used.
     """
     from sparsestyle_ns.evaluation.ablations import ablate as run

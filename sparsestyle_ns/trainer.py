@@ -401,6 +401,11 @@ class CoarseFewShotTrainer(SparseStyleTrainer):
 
     stage = "Stage 1"
 
+    def notes(self) -> Dict[str, Any]:
+        """What `SparseStyleTrainer.notes` has and, where a feature network took part, which."""
+        unseen = self.pipeline.unseen
+        return super().notes() | ({} if unseen is None else {"backbone": asdict(unseen.backbone.description)})
+
     def next_command(self) -> List[str]:
         """See `SparseStyleTrainer.next_command`."""
         return ns_train_style(self.base_dir, self.config)

@@ -4,7 +4,7 @@ import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Dict, List
+from typing import TYPE_CHECKING, Any, Dict, List
 
 import hypothesis
 import numpy as np
@@ -15,6 +15,7 @@ from PIL import Image
 
 if TYPE_CHECKING:
     from sparsestyle_ns.effects.base import Decisions
+    from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "data_scripts")]
@@ -60,6 +61,37 @@ def decided(*on: str, **parameters: Dict[str, List[float]]) -> "Decisions":
         Decision(name, name in on, None, None, "for a test", parameters=parameters.get(name, {})) for name in EFFECTS
     )
     return Decisions(tuple(items))
+
+
+def coarse_pipeline(scene: Path, **settings: Any) -> "CoarseFewShotPipeline":
+    """A pipeline of stage 1, ready to train, whose small field isn't the same everywhere.
+
+    Args:
+        scene: an LLFF scene.
+        settings: the pipeline's; and `views` and `exposure`, how many photos and whether they have their own.
+    """
+    from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+
+    from sparsestyle_ns.datamanager import FewShotDataManagerConfig
+    from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
+    from sparsestyle_ns.effects.registry import EffectSettings
+    from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig, CoarseFieldConfig
+    from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
+
+    # Without the grid, which remembers what is rendered, the same rays get the same colours twice.
+    effects = EffectSettings(exposure=settings.pop("exposure", "off"), matched_depth="off", empty_space="off")
+    manager = FewShotDataManagerConfig(
+        data=scene, dataparser=LLFFDataParserConfig(), train_num_rays_per_batch=16, num_views=settings.pop("views", 3)
+    )
+    field = CoarseFieldConfig(num_levels=3, num_layers=2, layer_width=16, feature_dim=4)
+    model = CoarseFewShotModelConfig(coarse_field=field, num_samples=8, precision="float32")
+    torch.manual_seed(0)
+    config = CoarseFewShotPipelineConfig(datamanager=manager, model=model, effects=effects, **settings)
+    pipeline = config.setup(device="cpu")
+    with torch.no_grad():
+        pipeline.model.field.density_head.weight.normal_(std=2.0)
+    pipeline.get_training_callbacks(TrainingCallbackAttributes(None, None, pipeline, None))
+    return pipeline
 
 
 def ns_train(method: str, data: Path, output_dir: Path, *flags: str, parser: str = "llff-data") -> None:

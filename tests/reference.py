@@ -35,6 +35,12 @@ def nnfm_loss(features, style_features):
     return sum(distances) / len(distances)
 
 
+def semantic_loss(maps, target_maps):
+    """1 − cos of the means of two feature maps [C][h][w] over their places."""
+    means = [[sum(map(sum, channel)) / sum(map(len, channel)) for channel in each] for each in (maps, target_maps)]
+    return 1 - cosine(*means)
+
+
 def content_loss(features, target):
     """Σ (f − f*)² / Σ f*²."""
     pairs = list(zip(features.flatten().tolist(), target.flatten().tolist(), strict=True))
@@ -61,6 +67,22 @@ def palette_transform(content_mean, content_covariance, style_mean, style_covari
     """A = Σ_s^½ Σ_c^−½ and b = μ_s − A μ_c by SciPy's general matrix square root; Σ_c must be invertible."""
     matrix = scipy.linalg.sqrtm(style_covariance) @ np.linalg.inv(scipy.linalg.sqrtm(content_covariance))
     return matrix, style_mean - matrix @ content_mean
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# evaluation
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def frechet_distance(first, second):
+    """FID by SciPy's general matrix square root; both covariances must be regular."""
+    means, covariances = [], []
+    for sample in (first, second):
+        means.append(sum(np.array(row) for row in sample.tolist()) / len(sample))
+        differences = [np.array(row) - means[-1] for row in sample.tolist()]
+        covariances.append(sum(np.outer(row, row) for row in differences) / (len(sample) - 1))
+    root = scipy.linalg.sqrtm(covariances[0] @ covariances[1])
+    return float(np.sum((means[0] - means[1]) ** 2) + np.trace(covariances[0] + covariances[1] - 2 * root).real)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

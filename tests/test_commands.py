@@ -130,13 +130,14 @@ def test_a_stylised_checkpoint_holds_the_whole_scene_and_nothing_else(runs: Simp
 def test_a_stylised_run_renders_without_painting_weights_and_coarse_run(
     runs: SimpleNamespace, llff_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    import sparsestyle_ns.pipelines.base as base
     import sparsestyle_ns.pipelines.hier_style as pipeline
 
     def refuse(*args: object) -> None:
         raise AssertionError("rendering asked for the painting or the feature network")
 
     monkeypatch.setattr(pipeline, "load_style_image", refuse)
-    monkeypatch.setattr(pipeline, "load_backbone", refuse)
+    monkeypatch.setattr(base, "load_backbone", refuse)
     monkeypatch.setattr(pipeline.HierStylePipelineConfig, "load_targets", refuse)
     hidden = runs.coarse.rename(runs.coarse.parent / "hidden")
     try:

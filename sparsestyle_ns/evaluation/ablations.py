@@ -18,27 +18,20 @@ from sparsestyle_ns.evaluation.study import (
 from sparsestyle_ns.evaluation.study_page import Section, line_plot
 
 Kinds = Tuple[str, str]
+Groups = Dict[str, Tuple[str, Dict[str, Kinds]]]
 COARSE_NAMES = {
     "ours": "our stage 1",
     "paper": "stage 1 as the paper writes it",
     "vanilla": "vanilla NeRF",
+    "dietnerf": "semantic loss (DietNeRF's kind)",
     "freenerf": "FreeNeRF's regularisers",
 }
-FRAMEWORK: Dict[str, Kinds] = {
-    "ours": ("ours", "ours"),
-    **{
-        f"{COARSE_NAMES[coarse]} + {'our stage 2' if style == 'ours' else 'ARF kind'}": (style, coarse)
-        for coarse in COARSE_NAMES
-        for style in ("ours", "arf")
-        if (style, coarse) != ("ours", "ours")
-    },
-}
-GROUPS: Dict[str, Tuple[str, Dict[str, Kinds]]] = {
-    "Coarse-to-fine framework (Fig. 5)": (
-        "Stage 2 on coarse fields of different kinds, against fine-tuning each of them. DietNeRF's semantic loss and "
-        "DiffusioNeRF are left out: they need networks whose weights aren't part of this package.",
-        FRAMEWORK,
-    ),
+WITH_DIETNERF = (
+    "The semantic loss is DietNeRF's with the features of VGG-16 for those of CLIP, whose weights aren't part of this "
+    "package; it is added to vanilla NeRF."
+)
+WITHOUT_DIETNERF = "A semantic loss of DietNeRF's kind is left out: no weights of VGG-16 were found for stage 1."
+GROUPS: Groups = {
     "Hierarchical representation (Fig. 6)": (
         "What the residual field sees of a position: the hash grid and e_c, e_c alone, or sines and cosines of ten "
         "octaves and e_c.",
@@ -53,15 +46,31 @@ GROUPS: Dict[str, Tuple[str, Dict[str, Kinds]]] = {
         {"ours": ("ours", "ours"), **{f"λ = {w}": (f"lambda-{w}", "ours") for w in ("10", "1", "0.1")}},
     ),
 }
-"""Of each ablation what it is about, and its rows with their kinds of stage 2 and stage 1."""
+"""Of each ablation of stage 2 what it is about, and its rows with their kinds of stage 2 and stage 1."""
 ANNEALING = "Content annealing (Fig. 8)"
 VIEWS_A_MEAN = 9
 """Iterations that a trace is averaged over: a multiple of the usual three views, one of which an iteration sees."""
 
 
-def ablation_experiments(study: Study, painting: Path) -> List[Experiment]:
+def ablation_groups(coarse_kinds: Sequence[str]) -> Groups:
+    """As `GROUPS`, after the group that compares these kinds of stage 1, of which the first is ours."""
+    rows = {
+        f"{COARSE_NAMES[coarse]} + {'our stage 2' if style == 'ours' else 'ARF kind'}": (style, coarse)
+        for coarse in coarse_kinds
+        for style in ("ours", "arf")
+        if (style, coarse) != ("ours", "ours")
+    }
+    text = (
+        "Stage 2 on coarse fields of different kinds, against fine-tuning each of them. "
+        f"{WITH_DIETNERF if 'dietnerf' in coarse_kinds else WITHOUT_DIETNERF} DiffusioNeRF is left out: it needs a "
+        "diffusion model whose weights aren't part of this package."
+    )
+    return {"Coarse-to-fine framework (Fig. 5)": (text, {"ours": ("ours", "ours"), **rows}), **GROUPS}
+
+
+def ablation_experiments(study: Study, painting: Path, groups: Groups) -> List[Experiment]:
     """The runs that the ablations need, each once."""
-    kinds = dict.fromkeys(pair for _, rows in GROUPS.values() for pair in rows.values())
+    kinds = dict.fromkeys(pair for _, rows in groups.values() for pair in rows.values())
     return [study.stylised(painting, style, coarse) for style, coarse in kinds]
 
 
@@ -71,12 +80,14 @@ def ablate(study: Study, paintings: Sequence[Path], laboratory: Laboratory) -> L
     Raises:
         InputError: a run failed.
     """
-    wanted = [each for painting in paintings for each in ablation_experiments(study, painting)]
+    coarse_kinds = study.coarse_kinds()
+    groups = ablation_groups(coarse_kinds)
+    wanted = [each for painting in paintings for each in ablation_experiments(study, painting, groups)]
     laboratory.run(wanted, lambda each, stop: save_picture_after(each.folder(study.scene), stop))
-    sections = [coarse_section(study, tuple(COARSE_NAMES))]
+    sections = [coarse_section(study, coarse_kinds)]
     for painting in paintings:
         painter = Painter(painting)
-        for heading, (text, rows) in GROUPS.items():
+        for heading, (text, rows) in groups.items():
             sections.append(_group(study, painter, heading, text, rows))
     return sections
 

@@ -1,6 +1,7 @@
 """Paths of cameras that are fixed by the training cameras, without chance or choice.
 
-One is that on which consistency is measured; the other, made of the same pieces, shows a scene in a film.
+One is that on which consistency is measured; others, made of the same pieces, show a scene in a film, and have views
+that nobody photographed.
 """
 
 import itertools
@@ -41,7 +42,7 @@ def measuring_path(cameras: Cameras) -> Cameras:
     if len(cameras) < 2:
         raise InputError("Consistency is measured between training views, and there is one; train on two or more.")
     poses = cameras.camera_to_worlds.cpu().float()
-    return _along(poses_between(poses) if look_one_way(poses) else poses_around(poses), cameras)
+    return at_poses(poses_between(poses) if look_one_way(poses) else poses_around(poses), cameras)
 
 
 def showing_path(cameras: Cameras, frames: int) -> Cameras:
@@ -56,10 +57,27 @@ def showing_path(cameras: Cameras, frames: int) -> Cameras:
     """
     poses = cameras.camera_to_worlds.cpu().float()
     if not look_one_way(poses):
-        return _along(poses_around(poses, 2.0 * math.pi / frames, frames), cameras)
+        return unseen_places(cameras, frames)
     fine = poses_between(poses, FLIGHT_STEPS * frames)
     place = 0.5 - 0.5 * torch.cos(torch.arange(frames) * (2.0 * math.pi / frames))
-    return _along(fine[(place * (len(fine) - 1)).round().long()], cameras)
+    return at_poses(fine[(place * (len(fine) - 1)).round().long()], cameras)
+
+
+def unseen_places(cameras: Cameras, count: int) -> Cameras:
+    """Cameras at equal steps where photos might have been taken, with the first training camera's lens, undistorted.
+
+    Where the training cameras look one way, on the way from each to the next in their order; where they stand all
+    around, on the circle about the point that they look at, level with them on average.
+
+    Args:
+        cameras: the training cameras, two or more.
+        count: how many; a few more may be given on a way.
+    """
+    # In float64, whose rounding, which differs with where vectors lie in memory, doesn't reach the float32 result.
+    poses = cameras.camera_to_worlds.cpu().double()
+    if look_one_way(poses):
+        return at_poses(poses_between(poses, count), cameras)
+    return at_poses(poses_around(poses, 2.0 * math.pi / count, count), cameras)
 
 
 def look_one_way(poses: Float[Tensor, "cameras 3 4"]) -> bool:
@@ -69,10 +87,11 @@ def look_one_way(poses: Float[Tensor, "cameras 3 4"]) -> bool:
     return bool((forward @ mean > FACING).all())
 
 
-def _along(path: Float[Tensor, "frames 3 4"], cameras: Cameras) -> Cameras:
-    count = len(path)
+def at_poses(poses: Float[Tensor, "frames 3 4"], cameras: Cameras) -> Cameras:
+    """Cameras at these poses, on the device of `cameras` and with the lens of the first of them, undistorted."""
+    count = len(poses)
     return Cameras(
-        camera_to_worlds=path.to(cameras.camera_to_worlds),
+        camera_to_worlds=poses.to(cameras.camera_to_worlds),
         **{name: getattr(cameras, name)[:1].expand(count, 1) for name in ("fx", "fy", "cx", "cy", "width", "height")},
     )
 

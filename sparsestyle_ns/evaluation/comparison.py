@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Callable, Dict, List, Optional, Sequence, Tuple
 
+from sparsestyle_ns.evaluation.art_fid import why_left_out
 from sparsestyle_ns.evaluation.baselines import can_transfer, smooth_along_flow, transfer_frames
 from sparsestyle_ns.evaluation.experiments import Experiment, Laboratory
 from sparsestyle_ns.evaluation.path_frames import PathFrames
@@ -16,7 +17,7 @@ from sparsestyle_ns.evaluation.study import (
     save_picture_after,
 )
 from sparsestyle_ns.evaluation.study_page import Section
-from sparsestyle_ns.evaluation.tables import Table, consistency_columns, table_of
+from sparsestyle_ns.evaluation.tables import STYLE_AND_CONTENT, Table, consistency_columns, table_of
 
 PAPER_ROWS: Dict[str, Tuple[float, ...]] = {
     "AdaIN": (0.189, 0.618, 0.276, 0.231, 0.601, 0.295),
@@ -134,12 +135,12 @@ def style_table(measured: Dict[str, Measured]) -> Table:
     """Style strength and content of each row."""
     ours = measured["ours"].figures
     before = {key: ours[f"{key}_before"] for key in ("style_loss", "gram_distance")}
-    keys = ("style_loss", "gram_distance", "content_loss", "content_ssim")
     rows = [(name, row.figures) for name, row in measured.items()]
     return table_of(
         "Style strength, and content kept, against the unstylised frames",
-        [(key, key, "") for key in keys],
+        [(key, key, "") for key in STYLE_AND_CONTENT],
         [*rows, ("the unstylised scene of ours", before)],
+        why_left_out(ours),
     )
 
 

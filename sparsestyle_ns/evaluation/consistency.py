@@ -89,7 +89,7 @@ def pair_consistency(
         "rmse": float(masked_rmse(first, warped, visible)),
         "ssim": float(masked_ssim(first, warped, visible)),
     }
-    for name, metric in (("lpips", lpips_metric()), ("st_lpips", st_lpips_metric(first.shape[:2]))):
+    for name, metric in (("lpips", lpips_metric(first.shape[:2])), ("st_lpips", st_lpips_metric(first.shape[:2]))):
         if metric is not None:
             values[name] = masked_distance(metric, first, warped, visible)
     return values

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torchvision.utils import save_image
 
+from sparsestyle_ns.evaluation.art_fid import ArtFID
 from sparsestyle_ns.evaluation.camera_path import measuring_path
 from sparsestyle_ns.evaluation.image_metrics import image_metrics, psnr
 from sparsestyle_ns.evaluation.path_frames import render_path
@@ -115,8 +116,9 @@ def evaluate_held_out(
 
     Coarse run: `psnr` in dB, `ssim`, `lpips` and `st_lpips` where there are weights, and `effective_samples`. Stylised
     run: the same of the coarse field with the prefix `coarse_`; `content_ssim`; with `targets` what
-    `stylisation_figures` gives; and the consistency of frames on the measuring path (`PathFrames.figures`), where there
-    are the two training cameras that it takes. All of these are of exact renders.
+    `stylisation_figures` gives and, where there are weights for it, `art_fid` of all views, with photos as content; and
+    the consistency of frames on the measuring path (`PathFrames.figures`), where there are the two training cameras
+    that it takes. All of these are of exact renders.
 
     Args:
         pipeline: in the state in which `eval_setup` leaves it.
@@ -127,6 +129,7 @@ def evaluate_held_out(
     model, views, rays, seconds = pipeline.model, [], [], []
     dataset = pipeline.datamanager.eval_dataset
     style_gram = None if targets is None else gram_matrix(targets.style_rows())
+    art_fid = None if targets is None else ArtFID.against(targets.style_image)
     for index in track(range(len(dataset)), "Held-out views"):
         camera = dataset.cameras[index : index + 1].to(model.device)
         photo = dataset[index]["image"][..., :3]
@@ -146,6 +149,8 @@ def evaluate_held_out(
                 values.update(
                     stylisation_figures(targets, style_gram, outputs["rgb_coarse"], outputs["rgb"], accumulation)
                 )
+            if art_fid is not None:
+                art_fid.add(outputs["rgb"], photo)
             if baked:
                 with model.rendering("baked"):
                     values["baked_psnr"] = psnr(model.get_outputs_for_camera(camera)["rgb"], outputs["rgb"])
@@ -156,6 +161,8 @@ def evaluate_held_out(
                 save_image(picture.permute(2, 0, 1).cpu(), picture_folder / f"eval_{name}_{index:04d}.png")
         views.append(values)
     means = {key: sum(values) / len(values) for key, values in by_figure(views).items()}
+    if art_fid is not None:
+        means.update(art_fid.figures())
     training_cameras = pipeline.datamanager.train_dataset.cameras
     if isinstance(model, HierStyleModel) and len(training_cameras) > 1:
         means.update(render_path(model, measuring_path(training_cameras)).figures())

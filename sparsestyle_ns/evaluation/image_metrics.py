@@ -23,6 +23,8 @@ SHIFT_TOLERANT_LAYERS = (
     ("net.slice5.13", None),
 )
 """Each layer's convolution and blur in the weight file."""
+MIN_LPIPS_SIDE = 31
+"""Pixels a side below which nothing is left of a picture for LPIPS' last layers."""
 MIN_SHIFT_TOLERANT_SIDE = 24
 """Pixels a side below which nothing is left of a picture for ST-LPIPS' last layers."""
 
@@ -32,17 +34,27 @@ def psnr(image: Float[Tensor, "H W 3"], reference: Float[Tensor, "H W 3"]) -> fl
     return float(-10.0 * torch.log10((image - reference).square().mean()))
 
 
-@functools.cache
-def lpips_metric() -> Optional[Callable[[Tensor, Tensor], Tensor]]:
-    """LPIPS with AlexNet, on the CPU; None where the network's weights are not in the torch hub cache.
+def hub_folder() -> Path:
+    """Where torch keeps weights that it has downloaded once."""
+    return Path(torch.hub.get_dir()) / "checkpoints"
 
-    torchmetrics would download them; measuring a picture must not depend on a network.
-    """
-    if not (Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET_FILE).is_file():
-        return None
+
+@functools.cache
+def _load_lpips(weights: Path) -> Callable[[Tensor, Tensor], Tensor]:
+    """The metric with these weights, which torchmetrics finds by itself."""
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
+
+
+def lpips_metric(size: Tuple[int, ...]) -> Optional[Callable[[Tensor, Tensor], Tensor]]:
+    """LPIPS with AlexNet for pictures of a height and width, on the CPU.
+
+    None where these are too small, or the network's weights are not in the torch hub cache. torchmetrics would download
+    them; measuring a picture must not depend on a network.
+    """
+    path = hub_folder() / ALEXNET_FILE
+    return _load_lpips(path) if path.is_file() and min(size) >= MIN_LPIPS_SIDE else None
 
 
 class ShiftTolerantLPIPS:
@@ -111,7 +123,7 @@ def image_metrics(image: Float[Tensor, "H W 3"], photo: Float[Tensor, "H W 3"]) 
         "psnr": psnr(image, photo),
         "ssim": float(structural_similarity_index_measure(batch, reference, data_range=1.0)),
     }
-    for name, metric in (("lpips", lpips_metric()), ("st_lpips", st_lpips_metric(photo.shape[:2]))):
+    for name, metric in (("lpips", lpips_metric(photo.shape[:2])), ("st_lpips", st_lpips_metric(photo.shape[:2]))):
         if metric is not None:
             metrics[name] = float(metric(batch, reference))
     return metrics

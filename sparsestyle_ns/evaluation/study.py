@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 
 from sparsestyle_ns.coarse_run import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.evaluation.art_fid import ArtFID, missing_weights
 from sparsestyle_ns.evaluation.camera_path import measuring_path
 from sparsestyle_ns.evaluation.experiments import Experiment, SceneSettings
 from sparsestyle_ns.evaluation.held_out import evaluate_run, saved_report, stylisation_figures
@@ -25,28 +26,32 @@ from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.progress import track
 from sparsestyle_ns.run_folder import REPORT_FILE, load_run
 from sparsestyle_ns.style.targets import StyleTargets
+from sparsestyle_ns.style.vgg import can_load_backbone
 
 HIGH_FREQUENCIES = (
     *("--pipeline.model.coarse-field.num-levels", "10"),
     *("--pipeline.model.distortion-weight", "0"),
 )
+VANILLA = (*HIGH_FREQUENCIES, "--pipeline.model.coarse-field.num-layers", "8")
 COARSE_KINDS: Dict[str, Tuple[str, ...]] = {
     "ours": (),
     "paper": ("--pipeline.model.distortion-weight", "0"),
-    "vanilla": (*HIGH_FREQUENCIES, "--pipeline.model.coarse-field.num-layers", "8"),
+    "vanilla": VANILLA,
+    "dietnerf": (*VANILLA, "--pipeline.semantic-weight", "0.1"),
     "freenerf": (
         *HIGH_FREQUENCIES,
         *("--pipeline.model.frequency-reveal", "0.9"),
         *("--pipeline.model.occlusion-weight", "0.01"),
     ),
 }
-"""Stage 1: as it is; as the paper writes it, on colours alone; NeRF's ten octaves, eight layers, view dependence; and
-ten octaves with FreeNeRF's regularisers."""
+"""Stage 1: as it is; as the paper writes it, on colours alone; NeRF's ten octaves, eight layers, view dependence; the
+same with a semantic loss of DietNeRF's kind; and ten octaves with FreeNeRF's regularisers."""
 COLORS_ALONE = ("--pipeline.effects.view-color", "on", "--pipeline.effects.matched-depth", "off")
 SCENE_KINDS: Dict[str, Tuple[str, ...]] = {
     "ours": (),
     "paper": COLORS_ALONE,
     "vanilla": COLORS_ALONE,
+    "dietnerf": COLORS_ALONE,
     "freenerf": COLORS_ALONE,
 }
 """What both stages have to be told of a kind of stage 1."""
@@ -101,6 +106,12 @@ class Study:
     coarse_iterations: Optional[int] = None
     style_iterations: Optional[int] = None
 
+    def coarse_kinds(self) -> Tuple[str, ...]:
+        """The kinds of stage 1 that can be trained here: without weights of a feature network, not `dietnerf`."""
+        names_weights = any("vgg-weights" in flag.replace("_", "-") for flag in self.coarse_flags)
+        found = names_weights or can_load_backbone()
+        return tuple(kind for kind in COARSE_KINDS if found or kind != "dietnerf")
+
     def coarse(self, kind: str) -> Experiment:
         """The experiment of stage 1 of a kind."""
         method = "coarse-fewshot-draft" if self.draft else "coarse-fewshot"
@@ -147,7 +158,7 @@ class Painter:
         self._gram: Optional[torch.Tensor] = None
 
     def figures(self, frames: PathFrames, settings: Any) -> Dict[str, float]:
-        """Style strength and content kept, means over every `STYLE_EVERY`th frame.
+        """Style strength and content kept, means over every `STYLE_EVERY`th frame, and ArtFID of all of these.
 
         Args:
             frames: the frames.
@@ -156,14 +167,17 @@ class Painter:
         if self._targets is None:
             self._targets = replace(settings, style_image=self.painting).load_targets(torch.device("cpu"))
             self._gram = gram_matrix(self._targets.style_rows())
-        values = []
+        values, art_fid = [], ArtFID.against(self._targets.style_image)
         for index in track(range(0, len(frames.stylised), STYLE_EVERY), "Style and content"):
             stylised, coarse = frames.stylised[index], frames.coarse[index]
             figures = stylisation_figures(
                 self._targets, self._gram, coarse, stylised, frames.surfaces[index].covered.float()
             )
             values.append({**figures, "content_ssim": image_metrics(stylised, coarse)["ssim"]})
-        return {key: sum(value[key] for value in values) / len(values) for key in values[0]}
+            if art_fid is not None:
+                art_fid.add(stylised, coarse)
+        means = {key: sum(value[key] for value in values) / len(values) for key in values[0]}
+        return means | ({} if art_fid is None else art_fid.figures())
 
 
 def measure_run(folder: Path, painter: Painter) -> Measured:
@@ -229,7 +243,9 @@ def _measure(folder: Path, step: int, frames: PathFrames, painter: Painter, sett
 def _read(folder: Path, step: int) -> Optional[Measured]:
     path = folder / "figures.json"
     content = json.loads(path.read_text()) if path.is_file() else {"step": None}
-    return Measured(content["figures"], *_pictures(folder)) if content["step"] == step else None
+    if content["step"] != step or not ("art_fid" in content["figures"] or missing_weights()):
+        return None
+    return Measured(content["figures"], *_pictures(folder))
 
 
 def _pictures(folder: Path) -> Tuple[List[Path], List[Path]]:

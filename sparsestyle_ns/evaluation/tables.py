@@ -7,6 +7,7 @@ from typing import Dict, List, Optional, Sequence, Tuple
 from rich.console import Console
 from rich.table import Table as RichTable
 
+from sparsestyle_ns.evaluation.art_fid import why_left_out
 from sparsestyle_ns.page import table
 
 LABELS: Dict[str, Tuple[str, int]] = {
@@ -19,11 +20,13 @@ LABELS: Dict[str, Tuple[str, int]] = {
     "effective_samples": ("effective samples a ray ↓", 2),
     "style_loss": ("NNFM to the style ↓", 4),
     "gram_distance": ("Gram distance to the style ↓", 4),
+    "art_fid": ("ArtFID ↓", 2),
     "content_loss": ("feature distance to the content ↓", 3),
     "content_ssim": ("SSIM to the photo ↑", 3),
     "baked_psnr": ("baked to exact, PSNR dB ↑", 1),
 }
 """A figure's name in words, with the direction that is better, and its decimals."""
+STYLE_AND_CONTENT = ("style_loss", "gram_distance", "art_fid", "content_loss", "content_ssim")
 PERCEPTUAL = ("rmse", "ssim", "lpips", "st_lpips")
 
 
@@ -105,10 +108,10 @@ def report_tables(means: Dict[str, float], num_views: int) -> List[Table]:
     tables = [table_of(f"Coarse field, {views}", [(f"{prefix}{k}", k, "") for k in quality], [("coarse", means)])]
     if not prefix:
         return tables
-    kept = [(key, key, "") for key in ("style_loss", "gram_distance", "content_loss", "content_ssim", "baked_psnr")]
+    kept = [(key, key, "") for key in (*STYLE_AND_CONTENT, "baked_psnr")]
     before = {key: means.get(f"{key}_before") for key in ("style_loss", "gram_distance")}
-    missing = "ArtFID is left out: its network's weights aren't part of this package."
-    tables.append(table_of(f"Style and content, {views}", kept, [("unstylised", before), ("stylised", means)], missing))
+    rows = [("unstylised", before), ("stylised", means)]
+    tables.append(table_of(f"Style and content, {views}", kept, rows, why_left_out(means)))
     if "short_rmse" in means:
         ceiling = {key[len("ceiling_") :]: value for key, value in means.items() if key.startswith("ceiling_")}
         columns = [*consistency_columns(), *((f"{part}_visible", "visible", f"{part} ") for part in ("short", "long"))]

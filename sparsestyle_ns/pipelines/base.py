@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Dict, Literal, Optional, Union
+from typing import Annotated, Any, Dict, Literal, Optional, Union
 
+import torch
 import tyro
 from nerfstudio.data.datamanagers.base_datamanager import DataManagerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
@@ -18,6 +19,7 @@ from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings
 from sparsestyle_ns.errors import InputError, exit_on_input_error
 from sparsestyle_ns.ffmpeg import put_ffmpeg_on_path
 from sparsestyle_ns.style.targets import StyleTargets
+from sparsestyle_ns.style.vgg import VGGFeatures, load_backbone
 
 TestMode = Literal["test", "val", "inference"]
 
@@ -32,6 +34,21 @@ class CheckedPipelineConfig(VanillaPipelineConfig):
     """Which effects are simulated; auto measures whether the scene calls for them."""
     decided: tyro.conf.Suppress[Optional[Decisions]] = None
     """What was decided, with its reasons; a loaded run has it and measures nothing."""
+    vgg_weights: Annotated[Optional[Path], tyro.conf.arg(aliases=("--vgg-weights",))] = None
+    """File with the weights of VGG-16. None: torchvision's, where they are cached or can be downloaded, else those in
+    the package stlpips-pytorch."""
+    backbone: Annotated[Literal["auto", "vgg16", "vgg16-shift-tolerant"], tyro.conf.arg(aliases=("--backbone",))] = (
+        "auto"
+    )
+    """Feature network; auto takes whichever of the two has weights."""
+
+    def load_backbone(self, device: torch.device) -> VGGFeatures:
+        """The feature network of these settings.
+
+        Raises:
+            InputError: there are no weights for it, or they can't be read.
+        """
+        return load_backbone(self.backbone, self.vgg_weights).to(device)
 
 
 class CheckedPipeline(VanillaPipeline):
@@ -72,6 +89,11 @@ class CheckedPipeline(VanillaPipeline):
         """What is simulated, and why."""
         assert self.config.decided is not None
         return self.config.decided
+
+    def announce(self, backbone: VGGFeatures) -> None:
+        """Says which feature network is in use, and where its weights came from."""
+        description = backbone.description
+        CONSOLE.print(f"Features: {description.name}, {description.source}", soft_wrap=True)
 
     def painting(self) -> Optional[StyleTargets]:
         """The painting to measure against, where the method has one and it is still there."""

@@ -1,15 +1,20 @@
 """The pipeline of `coarse-fewshot`: batches of rays of a few photos."""
 
 from dataclasses import dataclass, field
-from typing import List, Type
+from typing import Any, Dict, List, Optional, Tuple, Type
 
+import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 
 from sparsestyle_ns.effects.registry import decide_again
+from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel, CoarseFewShotModelConfig
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
+from sparsestyle_ns.style.image import SMALLEST_SIDE
+from sparsestyle_ns.unseen_views import UnseenViews
 
 
 @dataclass
@@ -19,6 +24,26 @@ class CoarseFewShotPipelineConfig(CheckedPipelineConfig):
     _target: Type = field(default_factory=lambda: CoarseFewShotPipeline)
     model: ModelConfig = field(default_factory=CoarseFewShotModelConfig)
     """The coarse field and how it is trained."""
+    semantic_weight: float = 0.0
+    """Weight of the semantic loss (DietNeRF's, with VGG-16 for CLIP; 0.1 there): views between the photos must look
+    like one of them to the feature network. 0 is off, and needs no network."""
+    semantic_every: int = 10
+    """Iterations from one semantic loss to the next."""
+    semantic_side: int = 64
+    """Longer side, in pixels, of the views rendered for it; all their rays are in memory at once."""
+
+    def check_semantic(self) -> None:
+        """Makes sure that the semantic loss can be had with these settings.
+
+        Raises:
+            InputError: a setting is out of its range.
+        """
+        if not 0.0 <= self.semantic_weight < float("inf"):
+            raise InputError(f"--pipeline.semantic-weight is {self.semantic_weight}; give a number from 0 on.")
+        if self.semantic_every < 1:
+            raise InputError(f"--pipeline.semantic-every is {self.semantic_every}; give 1 or more.")
+        if self.semantic_side < SMALLEST_SIDE:
+            raise InputError(f"--pipeline.semantic-side is {self.semantic_side}; give {SMALLEST_SIDE} or more pixels.")
 
 
 class CoarseFewShotPipeline(CheckedPipeline):
@@ -26,16 +51,47 @@ class CoarseFewShotPipeline(CheckedPipeline):
 
     config: CoarseFewShotPipelineConfig
     model: CoarseFewShotModel
+    unseen: Optional[UnseenViews] = None
+    """Views for the semantic loss, in training and where it is on."""
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> List[TrainingCallback]:
-        """Adds the decision about empty space to nerfstudio's callbacks."""
+        """Adds the decision about empty space to nerfstudio's callbacks, and prepares the semantic loss."""
+        self.config.check_semantic()
+        if self.config.semantic_weight > 0:
+            self.unseen = self.unseen_views()
         callbacks = super().get_training_callbacks(training_callback_attributes)
         if self.effects["empty_space"].choice == "auto":
             where = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
             callbacks.append(TrainingCallback(where_to_run=where, func=self.decide_empty_space))
         return callbacks
+
+    def unseen_views(self) -> UnseenViews:
+        """The views between the photos, with the feature network, which is announced.
+
+        Raises:
+            InputError: there is one photo only, or no network.
+        """
+        cameras, pixels = self.datamanager.train_dataset.cameras, self.datamanager.pixels
+        if len(cameras) < 2:
+            raise InputError("--pipeline.semantic-weight needs views between photos, and there is one; train on more.")
+        backbone = self.config.load_backbone(self.device)
+        self.announce(backbone)
+        colors = pixels.colors.tensor_split(pixels.starts[1:-1])
+        photos = [rows.view(*size, 3) for rows, size in zip(colors, pixels.sizes, strict=True)]
+        return UnseenViews(backbone, cameras, photos, self.config.semantic_side)
+
+    def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Any], Dict[str, Tensor], Dict[str, Any]]:
+        """Outputs, losses and metrics of a batch and, every `semantic_every` iterations, the loss of an unseen view.
+
+        Which view and which photo depends on the data manager's seed and the step alone.
+        """
+        outputs, losses, metrics = super().get_train_loss_dict(step)
+        if self.unseen is not None and step % self.config.semantic_every == 0:
+            generator = torch.Generator().manual_seed(self.datamanager.config.seed * 1_000_003 + step)
+            losses["semantic_loss"] = self.config.semantic_weight * self.unseen.loss(self.model, generator)
+        return outputs, losses, metrics
 
     def decide_empty_space(self, step: int) -> None:
         """After every tenth of the iterations from three quarters on, measures whether skipping empty space pays.

@@ -3,13 +3,12 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Dict, Iterator, List, Literal, Optional, Tuple, Type
+from typing import Annotated, Any, Dict, Iterator, List, Optional, Tuple, Type
 
 import psutil
 import torch
 import tyro
 from jaxtyping import Float
-from nerfstudio.cameras.camera_utils import get_interpolated_poses
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.base_model import ModelConfig
@@ -18,6 +17,7 @@ from torch import Tensor, nn
 
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.evaluation.camera_path import at_poses, poses_between
 from sparsestyle_ns.finite_steps import broken, step_if_finite
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
@@ -30,7 +30,7 @@ from sparsestyle_ns.schedules import content_weight
 from sparsestyle_ns.style.color import apply_palette, color_moments
 from sparsestyle_ns.style.image import load_style_image
 from sparsestyle_ns.style.targets import StyleTargets
-from sparsestyle_ns.style.vgg import VGGFeatures, load_backbone
+from sparsestyle_ns.style.vgg import VGGFeatures
 from sparsestyle_ns.viewer.panel import StylePanel
 
 
@@ -46,13 +46,6 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     coarse_run: Annotated[Optional[Path], tyro.conf.arg(aliases=("--coarse-run",))] = None
     """Folder or config.yml of the coarse-fewshot run to stylise. None: the newest finished one that matches the data
     and its settings, and where there is none it is trained first."""
-    vgg_weights: Annotated[Optional[Path], tyro.conf.arg(aliases=("--vgg-weights",))] = None
-    """File with the weights of VGG-16. None: torchvision's, where they are cached or can be downloaded, else those in
-    the package stlpips-pytorch."""
-    backbone: Annotated[Literal["auto", "vgg16", "vgg16-shift-tolerant"], tyro.conf.arg(aliases=("--backbone",))] = (
-        "auto"
-    )
-    """Feature network; auto takes whichever of the two has weights."""
     feature_side: int = 504
     """Longer side, in pixels, at which the feature network sees rendered views."""
     style_side: Optional[int] = None
@@ -97,7 +90,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
             raise InputError("There is no style image: name a painting with --style-image FILE.")
         if self.style_features is not None and self.style_features < 1:
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
-        return load_style_image(self.style_image), load_backbone(self.backbone, self.vgg_weights)
+        return load_style_image(self.style_image), self.load_backbone(torch.device("cpu"))
 
     def targets_of(self, image: Float[Tensor, "3 H W"], backbone: VGGFeatures) -> StyleTargets:
         """A painting as a feature network on its device sees it, with these settings."""
@@ -224,8 +217,7 @@ class HierStylePipeline(CheckedPipeline):
     def prepare_style(self) -> None:
         """Loads the painting and the feature network."""
         self.targets = self.config.load_targets(self.device)
-        backbone = self.targets.backbone.description
-        CONSOLE.print(f"Features: {backbone.name}, {backbone.source}", soft_wrap=True)
+        self.announce(self.targets.backbone)
 
     @torch.no_grad()
     def prepare_views(self) -> None:
@@ -319,27 +311,10 @@ class HierStylePipeline(CheckedPipeline):
         if self.config.novel_views == 0 or len(cameras) < 2:
             return []
         gaps = len(cameras) - 1
-        steps = math.ceil(self.config.novel_views / gaps)
-        novel = []
-        for first in range(gaps):
-            poses = get_interpolated_poses(
-                cameras.camera_to_worlds[first].cpu().numpy(),
-                cameras.camera_to_worlds[first + 1].cpu().numpy(),
-                steps + 2,
-            )
-            novel += [cameras.camera_to_worlds.new_tensor(pose) for pose in poses[1:-1]]
-        return [
-            Cameras(
-                camera_to_worlds=pose[None, :3],
-                fx=cameras.fx[:1],
-                fy=cameras.fy[:1],
-                cx=cameras.cx[:1],
-                cy=cameras.cy[:1],
-                width=cameras.width[:1],
-                height=cameras.height[:1],
-            )
-            for pose in novel[: self.config.novel_views]
-        ]
+        steps = math.ceil(self.config.novel_views / gaps) + 1
+        path = poses_between(cameras.camera_to_worlds.cpu(), gaps * steps + 1)
+        between = [pose for place, pose in enumerate(path) if place % steps]
+        return [at_poses(pose[None], cameras) for pose in between[: self.config.novel_views]]
 
     def _in_style_colors(self, pictures: List[Tensor], targets: StyleTargets, effects: Decisions) -> List[Tensor]:
         """Pictures with the painting's colours; where the scene is transparent the background stays as it is."""

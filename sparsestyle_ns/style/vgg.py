@@ -153,6 +153,15 @@ def load_backbone(
     return VGGFeatures(Backbone(name=name, source=source, sha256=_sha256(path)), trunk)
 
 
+def can_load_backbone() -> bool:
+    """Whether `load_backbone()` finds weights, or, where it would have to, can download them."""
+    try:
+        _find_weights("auto", None)
+    except InputError:
+        return False
+    return True
+
+
 def _find_weights(backbone: str, weights: Optional[Path]) -> tuple[Path, str]:
     """The weight file to read, and in words where it was found."""
     if weights is not None:

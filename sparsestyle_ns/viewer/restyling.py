@@ -26,7 +26,7 @@ from sparsestyle_ns.files import write_whole
 from sparsestyle_ns.finite_steps import FiniteOptimizers
 from sparsestyle_ns.processes import num_processes
 from sparsestyle_ns.scene_record import FILE_NAME as SCENE_RECORD
-from sparsestyle_ns.style.vgg import VGGFeatures, load_backbone
+from sparsestyle_ns.style.vgg import VGGFeatures
 from sparsestyle_ns.viewer.styles import StyleImage, save_thumbnail
 
 SEED = 42
@@ -90,7 +90,7 @@ class Workshop:
             return self.pipeline.targets.backbone
         if self._backbone is None:
             settings = self.pipeline.config
-            self._backbone = load_backbone(settings.backbone, settings.vgg_weights).to(self.pipeline.device)
+            self._backbone = settings.load_backbone(self.pipeline.device)
         return self._backbone
 
     def new_field(self) -> nn.Module:

@@ -1,5 +1,6 @@
 """What is off isn't there: no module, no parameter, no operation."""
 
+import functools
 from collections import Counter
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from conftest import decided
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch.nn.functional import normalize
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -19,6 +22,8 @@ from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import EffectSettings
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig, CoarseFieldConfig
 from sparsestyle_ns.models.hier_style import HierStyleModelConfig
+from sparsestyle_ns.pipelines import base as pipelines
+from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
 from sparsestyle_ns.rendering.space import BoxSpace, ContractedSpace, ForwardFacingSpace
 
 BOX = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
@@ -217,6 +222,37 @@ def test_without_matched_depth_no_ray_is_trained_on_that_has_no_colour(tmp_path:
         return counted.counts
 
     assert operations(rays).total() < operations(more_rays).total()
+
+
+def test_without_a_semantic_loss_no_network_is_loaded_and_no_operation_is_run(
+    llff_scene: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def trained(weight: float):
+        manager = FewShotDataManagerConfig(
+            data=llff_scene, dataparser=LLFFDataParserConfig(), train_num_rays_per_batch=20
+        )
+        model = CoarseFewShotModelConfig(coarse_field=CoarseFieldConfig(**FIELD), num_samples=6)
+        config = CoarseFewShotPipelineConfig(
+            datamanager=manager, model=model, semantic_weight=weight, semantic_side=16, semantic_every=2
+        )
+        pipeline = config.setup(device="cpu")
+        pipeline.get_training_callbacks(TrainingCallbackAttributes(None, None, pipeline, None))
+        pipeline.get_train_loss_dict(1)  # what is found once, when training begins
+        counts = []
+        for train in (pipeline.get_train_loss_dict, functools.partial(VanillaPipeline.get_train_loss_dict, pipeline)):
+            for step in (0, 1):
+                pipeline.zero_grad()
+                with Operations() as counted:
+                    sum(train(step)[1].values()).backward()
+                counts.append(counted.counts)
+        return pipeline, counts
+
+    on, (with_it, between, plain, _) = trained(0.1)
+    assert with_it.total() > between.total() == plain.total()
+    monkeypatch.setattr(pipelines, "load_backbone", lambda *_: pytest.fail("the network was loaded"))
+    off, (without, *others) = trained(0.0)
+    assert off.unseen is None and names(on) == names(off)
+    assert all(counts == without for counts in others)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,14 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 
 from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.evaluation.camera_path import ARC_STEP, NUM_FRAMES, axes_meet, measuring_path
+from sparsestyle_ns.evaluation.camera_path import (
+    ARC_STEP,
+    NUM_FRAMES,
+    at_poses,
+    axes_meet,
+    measuring_path,
+    unseen_places,
+)
 
 
 def cameras_at(positions: torch.Tensor, looking_at: torch.Tensor) -> Cameras:
@@ -54,6 +61,26 @@ def test_cameras_all_around_are_measured_on_an_arc_that_looks_at_the_middle() ->
     identity = torch.eye(3).expand(NUM_FRAMES, 3, 3)
     torch.testing.assert_close(turns.transpose(1, 2) @ turns, identity, atol=1e-5, rtol=0)
     torch.testing.assert_close(torch.linalg.det(turns), torch.ones(NUM_FRAMES), atol=1e-5, rtol=0)
+
+
+def test_unseen_places_are_between_cameras_that_look_one_way() -> None:
+    places = unseen_places(row(3), 100)
+    x = places.camera_to_worlds[:, 0, 3]
+    assert len(places) >= 100
+    torch.testing.assert_close(x, torch.linspace(-1, 1, len(places)), atol=1e-5, rtol=0)
+
+
+def test_unseen_places_are_all_around_where_cameras_are() -> None:
+    offsets = unseen_places(ring(5), 100).camera_to_worlds[:, :, 3] - torch.tensor([0.5, -0.2, 0.0])
+    torch.testing.assert_close(offsets.norm(dim=-1), torch.full((100,), math.sqrt(17.0)), atol=1e-4, rtol=0)
+    torch.testing.assert_close(offsets.mean(dim=0), torch.tensor([0.0, 0.0, 1.0]), atol=1e-4, rtol=0)
+
+
+def test_cameras_are_put_at_poses_with_the_first_ones_lens() -> None:
+    cameras = ring(5)
+    moved = at_poses(cameras.camera_to_worlds[3:], cameras)
+    torch.testing.assert_close(moved.camera_to_worlds, cameras.camera_to_worlds[3:])
+    assert moved.fx.tolist() == [[30.0], [30.0]] and moved.height.tolist() == [[24], [24]]
 
 
 def test_the_path_is_the_same_each_time_and_has_the_training_cameras_lens() -> None:

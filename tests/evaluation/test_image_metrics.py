@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from torchvision.models import alexnet
 
 from sparsestyle_ns.evaluation import image_metrics as module
 from sparsestyle_ns.evaluation.image_metrics import (
@@ -20,7 +21,7 @@ def photo():
 
 @pytest.fixture
 def without_lpips(monkeypatch):
-    monkeypatch.setattr(module, "lpips_metric", lambda: None)
+    monkeypatch.setattr(module, "lpips_metric", lambda size: None)
     monkeypatch.setattr(module, "st_lpips_metric", lambda size: None)
 
 
@@ -70,7 +71,7 @@ def test_lpips_is_reported_where_it_can_be_computed(photo, monkeypatch):
         seen.append((image, reference))
         return torch.tensor(0.25)
 
-    monkeypatch.setattr(module, "lpips_metric", lambda: metric)
+    monkeypatch.setattr(module, "lpips_metric", lambda size: metric)
     image = photo.flip(1)
     assert image_metrics(image, photo)["lpips"] == 0.25
     assert torch.equal(seen[0][0][0], image.permute(2, 0, 1)) and torch.equal(seen[0][1][0], photo.permute(2, 0, 1))
@@ -82,13 +83,25 @@ def test_without_its_weights_lpips_is_left_out_and_nothing_is_downloaded(photo, 
 
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(torch.hub, "load_state_dict_from_url", download)
-    lpips_metric.cache_clear()
-    try:
-        assert lpips_metric() is None
-        assert image_metrics(photo, photo).keys() == {"psnr", "ssim", "st_lpips"}
-    finally:
-        lpips_metric.cache_clear()
+    assert lpips_metric((64, 64)) is None
+    assert image_metrics(photo, photo).keys() == {"psnr", "ssim", "st_lpips"}
     assert ALEXNET_FILE.startswith("alexnet")
+
+
+def test_lpips_is_torchmetrics_with_the_weights_in_the_cache_and_of_pictures_that_are_large_enough(
+    monkeypatch, tmp_path
+):
+    torch.manual_seed(0)
+    state = alexnet(weights=None).state_dict()
+    for name, value in state.items():
+        if name.startswith("classifier"):  # LPIPS doesn't use it, and it is most of the file
+            state[name] = torch.zeros(1).expand(value.shape)
+    (tmp_path / "checkpoints").mkdir()
+    torch.save(state, tmp_path / "checkpoints" / ALEXNET_FILE)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    assert lpips_metric((30, 500)) is None
+    picture = torch.rand(1, 3, 31, 31)
+    assert lpips_metric((31, 31))(picture, picture) == 0 < lpips_metric((31, 31))(picture, 1 - picture)
 
 
 def test_st_lpips_is_what_its_authors_code_gives():

@@ -16,14 +16,22 @@ from nerfstudio.utils import writer
 from PIL import Image
 
 from sparsestyle_ns.cli import main
+from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation import comparison
 from sparsestyle_ns.evaluation import study as study_module
-from sparsestyle_ns.evaluation.ablations import GROUPS, ablate, ablation_experiments, annealing_plots, moving_mean
+from sparsestyle_ns.evaluation.ablations import (
+    ablate,
+    ablation_experiments,
+    ablation_groups,
+    annealing_plots,
+    moving_mean,
+)
 from sparsestyle_ns.evaluation.comparison import PAPER_ROWS, comparison_experiments
 from sparsestyle_ns.evaluation.experiments import Experiment, Laboratory, SceneSettings
-from sparsestyle_ns.evaluation.study import STYLE_KINDS, Study, picture_after
+from sparsestyle_ns.evaluation.study import COARSE_KINDS, STYLE_KINDS, Study, picture_after
 from sparsestyle_ns.evaluation.study_page import write_study
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.style import vgg
 
 
 def study(draft: bool = True) -> Study:
@@ -49,17 +57,34 @@ def test_the_comparisons_runs_are_ours_arfs_kind_and_freenerfs(painting: Path) -
 
 
 def test_each_ablation_of_the_paper_is_a_run_and_none_is_done_twice(painting: Path) -> None:
-    runs = ablation_experiments(study(), painting)
+    runs = ablation_experiments(study(), painting, ablation_groups(tuple(COARSE_KINDS)))
     names = [each.name.removesuffix(f"-{painting.stem}") for each in runs]
     assert len(set(names)) == len(names)
-    framework = {
-        f"{coarse}-{style}" for coarse in ("ours", "paper", "vanilla", "freenerf") for style in ("ours", "arf")
-    }
+    kinds = ("ours", "paper", "vanilla", "dietnerf", "freenerf")
+    framework = {f"{coarse}-{style}" for coarse in kinds for style in ("ours", "arf")}
     assert set(names) == framework | {f"ours-{kind}" for kind in STYLE_KINDS}
     assert {each.name for each in comparison_experiments(study(), painting)} <= {each.name for each in runs}
     with_pictures = {name for name, each in zip(names, runs, strict=True) if each.stops}
     assert with_pictures == {"ours-ours", "ours-lambda-10", "ours-lambda-1", "ours-lambda-0.1"}
     assert all(each.stops == (20, 100) for each in runs if each.stops)
+
+
+def test_without_a_feature_network_the_semantic_loss_is_left_out_and_said_to_be(
+    painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_weights(backbone: str, weights: None) -> None:
+        raise InputError("There are no weights.")
+
+    monkeypatch.setattr(vgg, "_find_weights", no_weights)
+    kinds = study().coarse_kinds()
+    assert kinds == ("ours", "paper", "vanilla", "freenerf")
+    groups = ablation_groups(kinds)
+    assert not any("dietnerf" in each.name for each in ablation_experiments(study(), painting, groups))
+    text, _ = groups["Coarse-to-fine framework (Fig. 5)"]
+    assert "DietNeRF's kind is left out: no weights of VGG-16 were found" in text
+    given = Study(study().scene, coarse_flags=("--vgg-weights=mine.pth",))
+    assert given.coarse_kinds() == tuple(COARSE_KINDS)
+    assert "left out: no weights" not in ablation_groups(given.coarse_kinds())["Coarse-to-fine framework (Fig. 5)"][0]
 
 
 def parse(experiment: Experiment, scene: SceneSettings, iterations: int) -> TrainerConfig:
@@ -71,15 +96,14 @@ def parse(experiment: Experiment, scene: SceneSettings, iterations: int) -> Trai
 
 def test_every_flag_of_every_kind_is_one_that_ns_train_knows(llff_scene: Path, painting: Path, tmp_path: Path) -> None:
     scene = SceneSettings(llff_scene, "llff-data", tmp_path, ("--max-image-side", "64"))
-    runs = ablation_experiments(Study(scene), painting)
+    runs = ablation_experiments(Study(scene), painting, ablation_groups(tuple(COARSE_KINDS)))
     wanted = dict.fromkeys([*runs, *(run.coarse for run in runs)])
     parsed = {each.name: parse(each, scene, 7) for each in wanted}
     assert all(config.max_num_iterations == 7 for config in parsed.values())
     assert all(config.pipeline.datamanager.max_image_side == 64 for config in parsed.values())
-    octaves = {
-        kind: parsed[kind].pipeline.model.coarse_field.num_levels for kind in ("ours", "paper", "vanilla", "freenerf")
-    }
-    assert octaves == {"ours": 7, "paper": 7, "vanilla": 10, "freenerf": 10}
+    octaves = {kind: parsed[kind].pipeline.model.coarse_field.num_levels for kind in COARSE_KINDS}
+    assert octaves == {"ours": 7, "paper": 7, "vanilla": 10, "dietnerf": 10, "freenerf": 10}
+    assert [kind for kind in COARSE_KINDS if parsed[kind].pipeline.semantic_weight > 0] == ["dietnerf"]
     assert parsed["freenerf"].pipeline.model.occlusion_weight > 0 == parsed["vanilla"].pipeline.model.occlusion_weight
     settings = {kind: parsed[f"ours-{kind}-{painting.stem}"].pipeline for kind in STYLE_KINDS}
     encodings = {kind: config.model.fine_encoding for kind, config in settings.items()}
@@ -199,10 +223,12 @@ def test_ablations_set_out_each_group_with_traces_and_pictures_on_the_way(
     monkeypatch.setattr(Experiment, "folder", lambda experiment, _: coarse if experiment.coarse is None else style)
     monkeypatch.setattr(Laboratory, "run", lambda *_: None)
     sections = ablate(study(), [painting], Laboratory(study().scene, 1))
-    assert [section.heading.split(":")[0] for section in sections[1:]] == list(GROUPS)
-    assert [name for name, _ in sections[0].tables[0].rows] == ["ours", "paper", "vanilla", "freenerf"]
-    for section, (_, rows) in zip(sections[1:], GROUPS.values(), strict=True):
+    groups = ablation_groups(tuple(COARSE_KINDS))
+    assert [section.heading.split(":")[0] for section in sections[1:]] == list(groups)
+    assert [name for name, _ in sections[0].tables[0].rows] == ["ours", "paper", "vanilla", "dietnerf", "freenerf"]
+    for section, (text, rows) in zip(sections[1:], groups.values(), strict=True):
         assert [name for name, _ in section.tables[0].rows][: len(rows)] == list(rows)
+        assert section.text == text
     annealing = sections[-1]
     assert [len(section.plots) for section in sections] == [0, 0, 0, 0, 3]
     assert [caption for caption, _ in annealing.grid[0][1]] == ["after 20 iterations", "at the end"]
@@ -217,10 +243,10 @@ def test_ablate_runs_every_ablation_and_shows_traces_and_pictures_on_the_way(
 ) -> None:
     main(arguments("ablate", llff_scene, painting, tmp_path, 22))
     names = [name for name, _ in train_here]
-    assert len(set(names)) == 4 + 14
+    assert len(set(names)) == 5 + 16
     assert names.count(f"ours-ours-{painting.stem}") == 2  # up to its stop, and on
     page = (tmp_path / "ablate.html").read_text()
-    assert all(heading.split(" (")[0] in page for heading in GROUPS)
+    assert all(heading.split(" (")[0] in page for heading in ablation_groups(()))
     assert page.count("data:image/svg+xml") == 3
     assert page.count("after 20 iterations") >= 4
     assert not re.findall(r'(?:src|href)="(?!data:)', page)

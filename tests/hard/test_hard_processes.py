@@ -1,12 +1,13 @@
 """Several processes that train together give what one process gives."""
 
+import functools
 from pathlib import Path
 from typing import Any, Dict
 
 import pytest
 import torch
 import torch.distributed as dist
-from conftest import TINY, TINY_STYLE, ns_train, only_run
+from conftest import TINY, TINY_STYLE, coarse_pipeline, ns_train, only_run
 from hard import trial
 from hard.table import hard_case
 from torch import nn
@@ -131,6 +132,28 @@ def test_a_broken_gradient_in_one_process_skips_the_step_in_all(tmp_path):
     assert torch.equal(first[0], first[1])
     assert (first[2] < first[1]).all()
     assert first[3].tolist() == [1, 0, 0, 0]
+
+
+def _gradient_of_an_unseen_view(scene: Path, rank: int) -> torch.Tensor:
+    pipeline = coarse_pipeline(scene, semantic_weight=1.0, semantic_side=16)
+    pipeline.model.config.thinning = 0.0
+    parameters = list(pipeline.model.field.parameters())
+    pipeline.unseen.loss(pipeline.model, torch.Generator().manual_seed(0)).backward()
+    processes.average_gradients(parameters)
+    return torch.cat([parameter.grad.flatten() for parameter in parameters])
+
+
+@hard_case(
+    "two processes",
+    case="the semantic loss of an unseen view",
+    could_go_wrong="other views, half a picture for the network, or half the gradient",
+    must_hold="the gradient of one process, to 0.01% of its length",
+)
+def test_an_unseen_views_gradient_in_two_processes_is_that_in_one(llff_scene, tmp_path):
+    target = functools.partial(_gradient_of_an_unseen_view, llff_scene)
+    expected = target(0)
+    for found in in_two_processes(target, tmp_path):
+        assert (found - expected).norm() <= 1e-4 * expected.norm()
 
 
 def _square_in_shares(rank: int) -> torch.Tensor:

@@ -28,7 +28,7 @@ from sparsestyle_ns.effects.layouts import BoundedBox, Contraction, ForwardFacin
 from sparsestyle_ns.field_components import hash_grid, hash_grid_kernels, positional_encoding, thinned_mlp
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
-from sparsestyle_ns.losses import content, geometry, nnfm, reconstruction
+from sparsestyle_ns.losses import content, geometry, nnfm, reconstruction, semantic
 from sparsestyle_ns.rendering import (
     baked,
     compositing,
@@ -53,6 +53,7 @@ COVERED = set()
 ELSEWHERE = {
     "sparsestyle_ns.field_components.hash_grid_triton": "needs CUDA or Triton's interpreter: test_hash_grid.py",
     "sparsestyle_ns.rendering.baked_kernels.march_rays": "is what march_compiled calls",
+    "sparsestyle_ns.style.vgg.can_load_backbone": "takes no input: test_studies.py",
     "sparsestyle_ns.rendering.baked.march_compiled": "is what render_baked calls on a CPU",
 }
 """Modules and functions without a property of their own, and why."""
@@ -549,6 +550,18 @@ def test_squared_errors_are_relative_and_finite(data, count, size, dtype):
     for value in (loss, error):
         (gradient,) = torch.autograd.grad(value, features, retain_graph=True)
         assert gradient.isfinite().all()
+
+
+@covers(semantic.pooled_features, semantic.semantic_loss)
+@given(st.data(), COUNTS, st.integers(1, 9), st.integers(1, 9), ALL_FLOATS)
+def test_embeddings_of_any_size_are_at_most_opposite(data, count, channels, places, dtype):
+    low, high = (-4, 3) if dtype == torch.float16 else (-10, 15)
+    features = data.draw(tensors((count, channels, places, 2), low, high, signed=True, dtype=dtype)).requires_grad_()
+    targets = data.draw(tensors((count, channels), low, high, signed=True, dtype=dtype))
+    loss = semantic.semantic_loss(semantic.pooled_features(features), targets)
+    assert 0 <= loss <= 2 and loss.dtype in (torch.float32, torch.float64)
+    (gradient,) = torch.autograd.grad(loss, features)
+    assert gradient.isfinite().all()
 
 
 @covers(geometry.matched_depth_loss)
