@@ -23,6 +23,7 @@ from sparsestyle_ns.style.image import load_style_image
 
 SEEDS = (0, 1, 2)
 """Short trainings of one scene with different seeds differ by up to a decibel, so means over some are compared."""
+BENT = ("--distortion", "0.4", "--wander", "0.6")
 PARSERS = {"llff": LLFFDataParserConfig, "blender": BlenderDataParserConfig, "nerfstudio": NerfstudioDataParserConfig}
 
 
@@ -129,7 +130,8 @@ def held_out_psnr(
         ("blender", (), {"background": "on"}, {"background": "off"}),
         ("llff", ("--shiny", "0.8"), {"view_color": "on"}, {"view_color": "off"}),
         ("llff", ("--exposure", "0.7"), {"exposure": "on"}, {"exposure": "off"}),
-        ("nerfstudio", ("--distortion", "0.4"), {"lens_distortion": "on"}, {"lens_distortion": "off"}),
+        # Where all cameras look at one point, a wrong lens only bends the scene that is learned, and nobody sees it.
+        ("nerfstudio", BENT, {"lens_distortion": "on"}, {"lens_distortion": "off"}),
         ("blender", (), {"empty_space": "on"}, {"empty_space": "off"}),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else None,
@@ -137,7 +139,6 @@ def held_out_psnr(
 def test_an_effect_that_a_scene_calls_for_makes_held_out_views_better(scenes, layout, options, on, off):
     folder = scenes(layout, *options)
     with_it, without = (held_out_psnr(folder, layout, 300, effects) for effects in (on, off))
-    print(f"{layout} {options} {on}: {with_it:.2f} dB, {off}: {without:.2f} dB")
     assert with_it > without
 
 
