@@ -17,6 +17,7 @@ from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.field_components.point_encodings import FrequencyEncoding, NoEncoding, PointEncoding
+from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid
 from sparsestyle_ns.fields.fine_tuned import FineTunedField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
@@ -61,9 +62,9 @@ class HierStyleModelConfig(ModelConfig):
     stylised_field: Literal["residual", "coarse"] = "residual"
     """What is stylised: the residual field on the frozen coarse one (Eq. 2 and 3), or a copy of the coarse field
     itself, fine-tuned as ARF does; then the settings of the residual field mean nothing."""
-    fine_encoding: Literal["hash", "frequency", "none"] = "hash"
-    """What the residual field sees of a position beside e_c: the hash grid ψ(x), sines and cosines of
-    `frequency_levels` octaves, or nothing."""
+    fine_encoding: Literal["hash", "tiny-cuda-nn", "frequency", "none"] = "hash"
+    """What the residual field sees of a position beside e_c: the hash grid ψ(x), that of tiny-cuda-nn (on a GPU, where
+    it is installed; the run opens only there), sines and cosines of `frequency_levels` octaves, or nothing."""
     frequency_levels: int = 10
     """Octaves of the sines and cosines, where they take the hash grid's place."""
     hash_levels: int = 8
@@ -183,7 +184,8 @@ class HierStyleModel(Model):
             return NoEncoding()
         if config.fine_encoding == "frequency":
             return FrequencyEncoding(config.frequency_levels)
-        return HashGrid(
+        grid = TinyCudaGrid if config.fine_encoding == "tiny-cuda-nn" else HashGrid
+        return grid(
             config.hash_levels,
             config.min_resolution,
             config.max_resolution,
