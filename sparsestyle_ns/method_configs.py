@@ -98,7 +98,7 @@ coarse_fewshot = MethodSpecification(
 )
 coarse_fewshot_draft = MethodSpecification(
     config=_coarse_fewshot(draft=True),
-    description="coarse-fewshot for small machines: images of 128 pixels, about three minutes on two CPU cores.",
+    description="coarse-fewshot for small machines: images of 128 pixels, about two minutes on two CPU cores.",
 )
 hier_style = MethodSpecification(
     config=_hier_style(draft=False),
@@ -106,7 +106,7 @@ hier_style = MethodSpecification(
 )
 hier_style_draft = MethodSpecification(
     config=_hier_style(draft=True),
-    description="hier-style for small machines: images of 128 pixels, about four minutes on two CPU cores.",
+    description="hier-style for small machines: images of 128 pixels, about two minutes on two CPU cores.",
 )
 
 

@@ -11,6 +11,7 @@ from sparsestyle_ns.evaluation.tradeoff.budget import Budget, Costs, OutOfTimeEr
 from sparsestyle_ns.evaluation.tradeoff.pareto import (
     TIME_EXPONENT,
     decibels,
+    decibels_lost,
     error_that_costs,
     fastest_within,
     knee,
@@ -104,7 +105,7 @@ class Axis:
         plots: (x, y) metrics of each plot; the first is the main one.
         note: how it was measured.
         own_error: root mean square error of the field against held-out photos. Given, the error is one that only
-            saves time and may cost `FREE_LOSS` dB; None: the knee is recommended.
+            saves time and may cost `FREE_LOSS` dB more than need be; None: the knee is recommended.
         points: in order of measuring.
         left_out: values that weren't measured, and why.
         order: the observed order of convergence.
@@ -166,11 +167,17 @@ class Axis:
     def recommended(self) -> Optional[Point]:
         """The point to choose, by `rule`."""
         times, errors = self._times_and_errors()
-        if self.own_error is None:
-            index = knee(times, errors)
-        else:
-            index = fastest_within(times, errors, error_that_costs(FREE_LOSS, self.own_error))
+        index = knee(times, errors) if self.own_error is None else fastest_within(times, errors, self.free_error)
         return None if index is None else self.points[index]
+
+    @property
+    def free_error(self) -> float:
+        """The error that costs `FREE_LOSS` dB more than that of the most accurate point; `own_error` must be known.
+
+        Not than none at all: what other settings cost is in all points, and can't be saved here.
+        """
+        least = min(map(self.error_of, self.points), default=0.0)
+        return error_that_costs(FREE_LOSS + decibels_lost(least, self.own_error), self.own_error)
 
     @property
     def rule(self) -> str:
@@ -180,11 +187,9 @@ class Axis:
                 f"Recommended: the smallest error × time^{TIME_EXPONENT:g}. Beyond it, twice the time takes less than "
                 f"{1 - 2**-TIME_EXPONENT:.0%} off the error."
             )
-        limit = decibels(error_that_costs(FREE_LOSS, self.own_error))
         return (
-            f"Recommended: the fastest that costs at most {FREE_LOSS:g} dB against photos: the field itself has "
-            f"{decibels(self.own_error):.1f} dB there, so {limit:.1f} dB here; where nothing is that good, the most "
-            "accurate."
+            f"Recommended: the fastest that costs at most {FREE_LOSS:g} dB more against photos than the most accurate: "
+            f"the field itself has {decibels(self.own_error):.1f} dB there, so {decibels(self.free_error):.1f} dB here."
         )
 
     def content(self) -> Dict[str, Any]:

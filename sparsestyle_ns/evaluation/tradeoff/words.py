@@ -2,7 +2,7 @@
 
 from typing import List, Optional, Sequence
 
-from sparsestyle_ns.evaluation.tradeoff.axis import FREE_LOSS, Axis, Point
+from sparsestyle_ns.evaluation.tradeoff.axis import Axis, Point
 from sparsestyle_ns.evaluation.tradeoff.pareto import decibels_lost, time_factor_of_a_decibel
 
 SMALL_GAIN = 0.05
@@ -106,7 +106,7 @@ def is_worth_a_change(axis: Axis, chosen: Point, preset: Point) -> bool:
     if preset.median(axis.time) / chosen.median(axis.time) > ALSO_KEEP:
         return True
     if axis.own_error is not None:
-        return decibels_lost(axis.error_of(preset), axis.own_error) > FREE_LOSS
+        return axis.error_of(preset) > axis.free_error
     return axis.error_of(chosen) < (1.0 - SMALL_GAIN) * axis.error_of(preset)
 
 

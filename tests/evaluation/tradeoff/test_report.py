@@ -77,6 +77,12 @@ def test_an_error_that_only_saves_time_may_cost_a_tenth_of_a_decibel():
     assert "20.0 dB" in quadrature_axis().rule
 
 
+def test_what_all_settings_cost_alike_is_no_reason_to_take_the_slowest():
+    # All cost more than a tenth of a decibel, and the last two within a tenth of each other.
+    assert quadrature_axis(errors=(0.1, 0.041, 0.04)).recommended.setting == "32"
+    assert quadrature_axis(errors=(0.1, 0.06, 0.04)).recommended.setting == "64"
+
+
 def test_a_run_is_recommended_up_to_where_time_no_longer_pays():
     # 2.1 dB for two doublings is worth it, 0.5 dB for one isn't: 0.75 would be.
     assert training_axis().recommended.setting == "400"
