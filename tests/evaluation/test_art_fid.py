@@ -24,6 +24,7 @@ from sparsestyle_ns.evaluation.art_fid import (
     resized,
     squares,
 )
+from sparsestyle_ns.evaluation.comparison import style_table
 from sparsestyle_ns.evaluation.image_metrics import ALEXNET_FILE, lpips_metric
 
 
@@ -203,10 +204,14 @@ def test_rows_of_a_study_are_measured_again_once_there_are_weights(
 ) -> None:
     folder = shutil.copytree(runs.style, tmp_path / "scene" / "hier-style" / "run")
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    assert "art_fid" not in study.measure_run(folder, study.Painter(painting)).figures
+    without = study.measure_run(folder, study.Painter(painting))
+    assert "art_fid" not in without.figures
+    assert style_table({"ours": without}).note.startswith("ArtFID is left out: it needs art_inception.pth and alexnet")
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(torch_home))
     monkeypatch.setattr(art_fid, "SQUARE", 75)
     monkeypatch.setattr(art_fid, "SHORTER_SIDE", 90)
     measured = study.measure_run(folder, study.Painter(painting))
     assert measured.figures["art_fid"] > 1
+    table = style_table({"ours": measured})
+    assert "ArtFID ↓" in table.columns and table.note == ""
     assert study.measure_run(folder, study.Painter(Path("gone.png"))) == measured
