@@ -30,7 +30,10 @@ WITH_DIETNERF = (
     "The semantic loss is DietNeRF's with the features of VGG-16 for those of CLIP, whose weights aren't part of this "
     "package; it is added to vanilla NeRF."
 )
-WITHOUT_DIETNERF = "A semantic loss of DietNeRF's kind is left out: no weights of VGG-16 were found for stage 1."
+WITHOUT_DIETNERF = (
+    "A semantic loss of DietNeRF's kind is left out: no weights of VGG-16 were found for stage 1; name a file with "
+    "--coarse-flags='--vgg-weights FILE'."
+)
 GROUPS: Groups = {
     "Hierarchical representation (Fig. 6)": (
         "What the residual field sees of a position: the hash grid and e_c, e_c alone, or sines and cosines of ten "

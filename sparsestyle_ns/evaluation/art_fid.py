@@ -29,7 +29,7 @@ HEADS = ("fc1.", "fc2.", "AuxLogits1.", "AuxLogits2.")
 SQUARE = 299
 """Side of the squares, in pixels: that of the pictures that Inception-v3 was made for."""
 SHORTER_SIDE = 448
-"""Shorter side of the pictures that they are cut from: three squares fit in, each half over the next."""
+"""Shorter side, in pixels, of the pictures that they are cut from: one and a half squares."""
 STEP = 75
 """Pixels from one square to the next, at most."""
 

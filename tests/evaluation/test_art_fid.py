@@ -2,7 +2,6 @@
 
 import json
 import math
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Dict
@@ -23,8 +22,14 @@ from sparsestyle_ns.evaluation.art_fid import (
     missing_weights,
     resized,
     squares,
+    why_left_out,
 )
+from sparsestyle_ns.evaluation.comparison import style_table
 from sparsestyle_ns.evaluation.image_metrics import ALEXNET_FILE, lpips_metric
+from sparsestyle_ns.evaluation.path_frames import PathFrames
+from sparsestyle_ns.evaluation.tables import report_tables
+from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
+from sparsestyle_ns.style.image import load_style_image
 
 
 def sample(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -185,28 +190,41 @@ def test_evaluate_reports_it_where_its_weights_are(
 
 
 def test_without_its_weights_it_is_left_out_and_the_files_are_named(
-    runs: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(torch.hub, "load_state_dict_from_url", lambda *_, **__: pytest.fail("the network was asked"))
-    main(["evaluate", str(runs.style), "--output-path", str(tmp_path / "report.json")])
-    assert "art_fid" not in json.loads((tmp_path / "report.json").read_text())["results"]
-    printed = " ".join(capsys.readouterr().out.split())
-    assert f"ArtFID is left out: it needs {ART_INCEPTION_FILE} and {ALEXNET_FILE} in" in printed
+    assert ArtFID.against(torch.rand(3, 40, 50)) is None
+    sentence = f"ArtFID is left out: it needs {ART_INCEPTION_FILE} and {ALEXNET_FILE} in {tmp_path / 'checkpoints'}."
+    assert why_left_out({}) == sentence
+    assert report_tables({"coarse_psnr": 20.0, "style_loss": 0.1}, 3)[1].note == sentence
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / ALEXNET_FILE).touch()
     assert missing_weights() == [ART_INCEPTION_FILE]
+    assert why_left_out({"art_fid": 2.0}) == ""
+
+
+def test_a_row_of_a_study_has_it_for_every_fourth_frame(with_weights: None, painting: Path) -> None:
+    stylised, coarse = ([torch.rand(40, 50, 3) for _ in range(5)] for _ in range(2))
+    frames = PathFrames(stylised, coarse, [SimpleNamespace(covered=torch.ones(40, 50, dtype=torch.bool))] * 5)
+    figures = study.Painter(painting).figures(frames, HierStylePipelineConfig(feature_side=48))
+    expected = ArtFID.against(load_style_image(painting))
+    for index in (0, 4):
+        expected.add(stylised[index], coarse[index])
+    assert figures["art_fid"] == pytest.approx(expected.figures()["art_fid"])
+    ours = {**figures, "style_loss_before": 0.1, "gram_distance_before": 0.1}
+    table = style_table({"ours": study.Measured(ours, [])})
+    assert "ArtFID ↓" in table.columns and table.note == ""
 
 
 def test_rows_of_a_study_are_measured_again_once_there_are_weights(
-    runs: SimpleNamespace, painting: Path, torch_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    torch_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = shutil.copytree(runs.style, tmp_path / "scene" / "hier-style" / "run")
+    def known(figures: Dict[str, float]) -> bool:
+        (tmp_path / "figures.json").write_text(json.dumps({"step": 7, "figures": figures}))
+        return study._read(tmp_path, 7) is not None
+
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    assert "art_fid" not in study.measure_run(folder, study.Painter(painting)).figures
+    assert known({"style_loss": 0.1}) and known({"style_loss": 0.1, "art_fid": 2.0})
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(torch_home))
-    monkeypatch.setattr(art_fid, "SQUARE", 75)
-    monkeypatch.setattr(art_fid, "SHORTER_SIDE", 90)
-    measured = study.measure_run(folder, study.Painter(painting))
-    assert measured.figures["art_fid"] > 1
-    assert study.measure_run(folder, study.Painter(Path("gone.png"))) == measured
+    assert not known({"style_loss": 0.1}) and known({"style_loss": 0.1, "art_fid": 2.0})
