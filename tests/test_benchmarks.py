@@ -315,7 +315,8 @@ def test_vanilla_nerf_is_made_without_a_network_and_with_its_own_settings(llff_s
 def test_effects_are_timed_with_and_without_each_other(tmp_path, monkeypatch):
     monkeypatch.setattr(effects, "CACHE", tmp_path / "cache")
     only = ("exposure", "lens_distortion", "residual_density", "palette")
-    effects.main(effects.EffectOptions(quick=True, repeats=1, device="cpu", output_dir=tmp_path, only=only))
+    here = {"device": "cpu", "threads": torch.get_num_threads(), "output_dir": tmp_path}
+    effects.main(effects.EffectOptions(quick=True, repeats=1, only=only, **here))
     content = json.loads((tmp_path / "effects.json").read_text())
     assert tuple(row["name"] for row in content["rows"]) == only
     assert all(row["with_over_without"] > 0 for row in content["rows"])

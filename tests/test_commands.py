@@ -309,6 +309,7 @@ def test_a_coarse_run_that_ctrl_c_ends_within_hier_style_is_finished_by_the_comm
         ns_train("hier-style", llff_scene, tmp_path, *style)
     (resume,) = re.findall("finish it with (ns-train .*) and run this command again", str(ended.value.code))
     interrupted = only_run(tmp_path, "coarse-fewshot")
+    time.sleep(1)  # runs are named by the second, and the one that goes on is to be another one
     run_entrypoint(train.entrypoint, shlex.split(resume)[1:])
     ns_train("hier-style", llff_scene, tmp_path, *style)
     (checkpoint,) = tmp_path.glob("*/hier-style/*/nerfstudio_models/*.ckpt")
