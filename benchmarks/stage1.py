@@ -123,9 +123,8 @@ def vanilla_config(scene: Scene, options: Stage1Options) -> Any:
     method: TrainerConfig = copy.deepcopy(method_configs["vanilla-nerf"])
     ours = our_config(scene, options).pipeline.datamanager
     ours.train_num_rays_per_batch = 32 if options.quick else method.pipeline.datamanager.train_num_rays_per_batch
-    ours.effects = EffectSettings(
-        matched_depth="off"
-    )  # its rays have no colours, and this method knows of nothing else
+    # Rays to matched points have no colours, and this method knows of nothing else.
+    ours.effects = EffectSettings(matched_depth="off")
     method.pipeline.datamanager = ours
     near, far = load_photos(scene).train_dataparser_outputs.metadata["ndc_depth_range"]
     method.pipeline.model.collider_params = {"near_plane": near, "far_plane": far}

@@ -23,11 +23,11 @@ class TinyCudaGrid(FieldComponent):
 
     def __init__(
         self,
-        num_levels: int = 8,
-        min_resolution: int = 128,
-        max_resolution: int = 512,
-        features_per_level: int = 4,
-        log2_table_size: int = 19,
+        num_levels: int,
+        min_resolution: int,
+        max_resolution: int,
+        features_per_level: int,
+        log2_table_size: int,
     ) -> None:
         super().__init__(in_dim=3, out_dim=num_levels * features_per_level)
         if not encodings.TCNN_EXISTS:

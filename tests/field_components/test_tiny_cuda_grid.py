@@ -65,4 +65,4 @@ def test_a_residual_field_learns_through_it(library: None) -> None:
 def test_without_the_library_a_sentence_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(encodings, "TCNN_EXISTS", False)
     with pytest.raises(InputError, match="isn't installed here or finds no GPU; install it"):
-        TinyCudaGrid()
+        TinyCudaGrid(num_levels=2, min_resolution=4, max_resolution=8, features_per_level=2, log2_table_size=8)
