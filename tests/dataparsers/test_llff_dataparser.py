@@ -1,5 +1,6 @@
 """LLFF folders, written here with cameras whose poses can be worked out by hand, and the real fern where it is."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,8 @@ from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.rendering.ndc import ndc_rays
 
-FERN = Path(__file__).resolve().parents[3] / "shared" / "data" / "llff" / "fern"
+DATA = Path(os.environ.get("SPARSESTYLE_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+FERN = DATA / "llff" / "fern"
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 80.0
 """Full size of the tiny scenes; at 1/8 that is 8x6 pixels and a focal length of 10."""
@@ -470,7 +472,7 @@ print(type(all_dataparsers["llff-data"]).__name__)
     assert finished.stdout.split()[-1] == "LLFFDataParserConfig"
 
 
-@pytest.mark.skipif(not FERN.is_dir(), reason=f"the LLFF scene fern is not at {FERN}")
+@pytest.mark.skipif(not FERN.is_dir(), reason=f"{DATA} has no llff/fern; set SPARSESTYLE_DATA")
 def test_the_real_fern():
     train, test = parse(FERN, "train"), parse(FERN, "test")
     assert test.metadata["view_ids"] == [0, 8, 16] and len(train.image_filenames) == 17
