@@ -154,6 +154,7 @@ def style_config(scene: Scene, coarse: CoarseRun, longer_side: int, options: Opt
     config = at_size(method_config("hier-style"), scene, max(32, longer_side // 8) if options.quick else longer_side)
     pipeline = config.pipeline
     pipeline.style_image, pipeline.backbone = scene.style_image, BACKBONE
+    pipeline.model.fine_encoding = "hash"  # the plain way gets the same tables
     pipeline.model.coarse_field = copy.deepcopy(coarse.config.pipeline.model.coarse_field)
     if options.quick:
         pipeline.feature_side, pipeline.warm_start_steps = 64, 1

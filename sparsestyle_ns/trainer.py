@@ -32,6 +32,7 @@ from sparsestyle_ns.datamanager import FewShotDataManager
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.errors import InputError, exit_on_input_error
+from sparsestyle_ns.field_components.tiny_cuda_grid import has_tiny_cuda_nn
 from sparsestyle_ns.files import write_whole
 from sparsestyle_ns.finite_steps import FiniteOptimizers
 from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
@@ -427,24 +428,37 @@ class HierStyleTrainer(SparseStyleTrainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Checks the style's files, makes sure of a coarse run, and sets up the stylised run."""
         pipeline = self.config.pipeline
+        resumes = self.config.load_dir is not None or self.config.load_checkpoint is not None
+        if resumes:
+            self._adopt_checkpoint()
         pipeline.check_style()
+        self._check_encoding(resumes)
         for name in ("style_image", "vgg_weights"):  # the run may be measured from another folder
             path: Optional[Path] = getattr(pipeline, name)
             setattr(pipeline, name, None if path is None else path.expanduser().resolve())
         run = None
-        if self.config.load_dir is None and self.config.load_checkpoint is None:
+        if not resumes:
             manager = self._photos()
             run = self.coarse_run(manager)
             self.config.pipeline.coarse_run = run.folder.resolve()
             self.config.pipeline.model.coarse_field = copy.deepcopy(run.config.pipeline.model.coarse_field)
             self.config.pipeline.decided = self._decide(manager, run)
-        else:
-            self._adopt_shape_of_checkpoint()
         self._coarse_state = None if run is None else run.model_state()
         super().setup(test_mode)
         self.config.pipeline.backbone = self.pipeline.targets.backbone.description.name
         self._write_config(self.config)
         self._keep_thumbnail()
+
+    def _check_encoding(self, resumes: bool) -> None:
+        model = self.config.pipeline.model
+        if model.fine_encoding != "tiny-cuda-nn" or resumes:
+            return
+        if not has_tiny_cuda_nn(torch.device(self.device), model.features_per_level):
+            raise InputError(
+                "--pipeline.model.fine-encoding is tiny-cuda-nn, which isn't installed here, finds no GPU, or has no "
+                f"rows of {model.features_per_level} features (but of 1, 2, 4 and 8); leave the setting out: the hash "
+                "grid has kernels of its own."
+            )
 
     @check_main_thread
     def _write_config(self, config: TrainerConfig) -> None:
@@ -462,6 +476,7 @@ class HierStyleTrainer(SparseStyleTrainer):
             "backbone": asdict(self.pipeline.targets.backbone.description),
             "coarse_run": str(pipeline.coarse_run),
             "coarse_field": asdict(pipeline.model.coarse_field),
+            "fine_encoding": pipeline.model.fine_encoding,
         }
 
     def _load_checkpoint(self) -> None:
@@ -470,13 +485,19 @@ class HierStyleTrainer(SparseStyleTrainer):
             self.pipeline.model.adopt_coarse(self._coarse_state)
             self._coarse_state = None
 
-    def _adopt_shape_of_checkpoint(self) -> None:
-        """Takes the coarse field's settings from the run that is resumed; they came from its coarse run."""
+    def _adopt_checkpoint(self) -> None:
+        """Takes from the run that is resumed what was found out when it began: the coarse field, and what auto was."""
         # Its config.yml may be this command's own by now, where training goes on in the same folder.
         state = load_checkpoint(self.resumed_checkpoint())
-        if "coarse_field" in state:  # a coarse run's has none; loading it says what is wrong
-            self.config.pipeline.model.coarse_field = CoarseFieldConfig(**state["coarse_field"])
-            self.config.pipeline.coarse_run = Path(state["coarse_run"])
+        if "coarse_field" not in state:  # a coarse run's has none; loading it says what is wrong
+            return
+        pipeline = self.config.pipeline
+        pipeline.model.coarse_field = CoarseFieldConfig(**state["coarse_field"])
+        pipeline.coarse_run = Path(state["coarse_run"])
+        if pipeline.model.fine_encoding == "auto":
+            pipeline.model.fine_encoding = state.get("fine_encoding", "hash")
+        if pipeline.backbone == "auto" and pipeline.vgg_weights is None:
+            pipeline.backbone = state["backbone"]["name"]
 
     def coarse_run(self, manager: FewShotDataManager) -> CoarseRun:
         """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now.

@@ -168,6 +168,32 @@ def positional_encoding(x, num_levels):
     return encoded
 
 
+def tiny_cuda_encoding(position, params, num_levels, smallest, growth, features, table_size):
+    """ψ(x) as tiny-cuda-nn's GridEncoding (type Hash, linear) has it; params is its flat table."""
+    encoded, start = [], 0
+    for level in range(num_levels):
+        scale = smallest * growth**level - 1
+        side = math.ceil(scale) + 1
+        rows = min((side**3 + 7) // 8 * 8, table_size)
+        sums = [0.0] * features
+        for corner in range(8):
+            weight, place, stride, hashed = 1.0, 0, 1, 0
+            for axis, prime in enumerate((1, 2654435761, 805459861)):
+                scaled = position[axis] * scale + 0.5
+                step = corner >> axis & 1
+                weight *= scaled - math.floor(scaled) if step else 1 - (scaled - math.floor(scaled))
+                at = math.floor(scaled) + step
+                place += at * stride
+                stride *= side
+                hashed ^= at * prime & 0xFFFFFFFF
+            row = (hashed if stride > rows else place) % rows
+            for number in range(features):
+                sums[number] += weight * params[start + row * features + number]
+        encoded += sums
+        start += rows * features
+    return encoded
+
+
 def hash_encoding(position, table, resolutions, table_size):
     """ψ(x): on each level the eight corners' rows, each by the product of its nearness along the axes."""
     encoded = []

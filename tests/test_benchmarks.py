@@ -13,7 +13,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))  # benchmarks isn't in
 
 from nerfstudio.data.scene_box import SceneBox
 
-from benchmarks import _measure, _scene, effects, nnfm, profile, stability, stage1, summary
+from benchmarks import _measure, _scene, effects, nnfm, profile, stability, stage1, summary, torch_options
 from benchmarks._measure import Duration, Options, Ratio, Report
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation import machine
@@ -349,6 +349,46 @@ def test_operators_are_gathered_into_parts_whose_shares_sum_to_one():
         {"hash grid": 0.4, "matrix products": 0.4, profile.REST: 0.2}
     )
     assert list(found["matrix products"]["operators"]) == ["aten::addmm", "aten::mm"]
+
+
+def test_options_of_torch_are_set_beside_the_usual_way_and_beside_float32():
+    seconds = {"as it is": durations(2.0, 4.0), "float32": durations(3.0, 3.0), "fast": durations(1.0, 1.0)}
+    results = {
+        "as it is": torch.tensor([3.0, 4.0]),
+        "float32": torch.tensor([3.0, 4.0]),
+        "fast": torch.tensor([3.0, 3.5]),
+    }
+    rows = torch_options.times_as_fast(seconds, results)
+    assert rows["fast"] == {
+        "seconds": 1.0,
+        "times_as_fast": 3.0,
+        "spread": [2.0, 4.0],
+        "distance_to_float32": pytest.approx(0.1),
+    }
+    assert rows["as it is"]["times_as_fast"] == 1.0
+    assert torch_options.distance(torch.tensor([1, 2, 3, 4]), torch.tensor([1, 2, 0, 4])) == 0.25
+
+
+def test_an_option_that_doesnt_run_here_is_named_and_left_out(capsys):
+    def fails():
+        raise RuntimeError("no compiler\nand more")
+
+    works = {"as it is": lambda: torch.ones(1), "float32": lambda: torch.ones(1), "torch.compile": fails}
+    assert list(torch_options.tried(works)) == list(works) == ["as it is", "float32"]
+    assert capsys.readouterr().out == "torch.compile doesn't run here: RuntimeError no compiler\n"
+    with pytest.raises(RuntimeError, match="no compiler"):
+        torch_options.tried({"as it is": fails})
+
+
+@pytest.mark.parametrize("make", [torch_options.residual_works, torch_options.coarse_works])
+def test_options_of_torch_do_the_same_work(make, monkeypatch):
+    monkeypatch.setattr(torch_options, "HashGrid", lambda: HashGrid(2, 4, 8, 2, 8))
+    works = make(50, CPU)
+    assert list(works) == ["as it is", "float32", "bfloat16", "torch.compile"]
+    exact = works["float32"]()
+    assert exact.norm() > 0
+    for name in ("as it is", "bfloat16"):
+        assert (works[name]() - exact).norm() < 0.05 * exact.norm()
 
 
 def test_stage_1_is_compared_with_fields_that_look_at_every_sample(monkeypatch):

@@ -27,6 +27,7 @@ from sparsestyle_ns.coarse_run import newest_checkpoint, read_coarse_run
 from sparsestyle_ns.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.effects.registry import EFFECTS
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.style import vgg
 
 METHODS = ("coarse-fewshot", "coarse-fewshot-draft", "hier-style", "hier-style-draft")
 HASH_TABLE = "_model.residual.grid.table"
@@ -348,6 +349,43 @@ def test_a_checkpoint_of_another_shape_is_refused_instead_of_loaded_in_part(
     flags = ["--load-dir", str(runs.coarse / "nerfstudio_models"), "--max-num-iterations", "6"]
     with pytest.raises(SystemExit, match="doesn't fit this configuration"):
         ns_train("coarse-fewshot", llff_scene, tmp_path, *flags, "--pipeline.model.coarse-field.layer-width", "16")
+
+
+@pytest.mark.parametrize(
+    "note, sentence",
+    [
+        ({"backbone": {"name": "vgg16"}}, "There are no weights for --backbone vgg16"),
+        ({"fine_encoding": "frequency"}, "doesn't fit this configuration"),
+    ],
+)
+def test_what_was_chosen_when_a_run_began_is_not_chosen_again_when_it_goes_on(
+    runs: SimpleNamespace,
+    llff_scene: Path,
+    painting: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    note: dict,
+    sentence: str,
+) -> None:
+    """By notes that say what can't be here: they would only be missed if they were looked at."""
+    monkeypatch.setattr(vgg, "_download", lambda target: False)
+    folder = shutil.copytree(runs.style / "nerfstudio_models", tmp_path / "models")
+    state = torch.load(newest_checkpoint(folder), weights_only=True)
+    assert set(note) <= set(state)
+    torch.save({**state, **note}, newest_checkpoint(folder))
+    flags = [*TINY_STYLE, "--style-image", str(painting), "--load-dir", str(folder), "--max-num-iterations", "6"]
+    with pytest.raises(SystemExit, match=sentence):
+        ns_train("hier-style", llff_scene, tmp_path / "outputs", *flags)
+
+
+def test_tiny_cuda_nn_is_refused_in_a_sentence_where_it_isnt(
+    runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path
+) -> None:
+    flags = ["--style-image", str(painting), "--coarse-run", str(runs.coarse), *TINY_STYLE]
+    with pytest.raises(
+        SystemExit, match="is tiny-cuda-nn, which isn't installed here, finds no GPU, or has no rows of"
+    ):
+        ns_train("hier-style", llff_scene, tmp_path, *flags, "--pipeline.model.fine-encoding", "tiny-cuda-nn")
 
 
 def test_blender_scenes_train_too(tmp_path: Path, painting: Path) -> None:

@@ -16,6 +16,7 @@ from sparsestyle_ns.evaluation.study import (
     save_picture_after,
 )
 from sparsestyle_ns.evaluation.study_page import Section, line_plot
+from sparsestyle_ns.scene_record import SceneRecord
 
 Kinds = Tuple[str, str]
 Groups = Dict[str, Tuple[str, Dict[str, Kinds]]]
@@ -51,8 +52,8 @@ GROUPS: Groups = {
 }
 """Of each ablation of stage 2 what it is about, and its rows with their kinds of stage 2 and stage 1."""
 ANNEALING = "Content annealing (Fig. 8)"
-VIEWS_A_MEAN = 9
-"""Iterations that a trace is averaged over: a multiple of the usual three views, one of which an iteration sees."""
+SMOOTHED = 9
+"""Iterations, about, that a trace is averaged over: as many whole rounds of the views as come near."""
 
 
 def ablation_groups(coarse_kinds: Sequence[str]) -> Groups:
@@ -108,7 +109,9 @@ def _group(study: Study, painter: Painter, heading: str, text: str, rows: Dict[s
         grid=picture_grid(measured, measured["ours"].coarse_pictures),
     )
     if heading == ANNEALING:
-        section.plots = annealing_plots({name: loss_traces(folder) for name, folder in folders.items()})
+        num_views = len(SceneRecord.load(folders["ours"]).view_ids)
+        traces = {name: loss_traces(folder) for name, folder in folders.items()}
+        section.plots = annealing_plots(traces, smoothing(num_views))
         section.grid = [(name, _growth(folder, measured[name])) for name, folder in folders.items()]
     return section
 
@@ -119,14 +122,19 @@ def _growth(folder: Path, measured: Measured) -> List[Tuple[str, Path]]:
     return [*(each for each in early if each[1].is_file()), ("at the end", measured.pictures[1])]
 
 
-def annealing_plots(traces: Dict[str, Dict[str, Tuple[List[int], List[float]]]]) -> List[Tuple[str, str]]:
-    """Content against style loss on the way (Fig. 8 b), and both losses by iteration."""
+def smoothing(num_views: int) -> int:
+    """Iterations to average a trace over, of which each sees one view in turn."""
+    return num_views * max(1, round(SMOOTHED / num_views))
+
+
+def annealing_plots(traces: Dict[str, Dict[str, Tuple[List[int], List[float]]]], count: int) -> List[Tuple[str, str]]:
+    """Content against style loss on the way (Fig. 8 b), and both losses by iteration, means over `count` of them."""
     smooth = {
-        name: {loss: (steps, moving_mean(values, VIEWS_A_MEAN)) for loss, (steps, values) in both.items()}
+        name: {loss: (steps, moving_mean(values, count)) for loss, (steps, values) in both.items()}
         for name, both in traces.items()
     }
     pareto = {name: (both["content"][1], both["style"][1]) for name, both in smooth.items()}
-    mean = f"means over {VIEWS_A_MEAN} iterations"
+    mean = f"means over {count} iterations"
     return [
         (line_plot(pareto, "content loss", "style loss", marks=True), f"Way of both losses; dots: the end ({mean})."),
         *(

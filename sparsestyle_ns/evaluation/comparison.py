@@ -138,7 +138,7 @@ def style_table(measured: Dict[str, Measured]) -> Table:
     rows = [(name, row.figures) for name, row in measured.items()]
     return table_of(
         "Style strength, and content kept, against the unstylised frames",
-        [(key, key, "") for key in STYLE_AND_CONTENT],
+        [(key, key, "") for key in (*STYLE_AND_CONTENT, "unstylised_ssim")],
         [*rows, ("the unstylised scene of ours", before)],
         why_left_out(ours),
     )

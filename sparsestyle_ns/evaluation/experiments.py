@@ -19,6 +19,7 @@ from typing import Callable, Dict, List, Optional, Sequence, Tuple
 
 from sparsestyle_ns.coarse_run import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.files import write_whole
 from sparsestyle_ns.progress import Bar, bar, duration, say
 
 SECONDS_FILE = "training_seconds.json"
@@ -192,7 +193,7 @@ class Laboratory:
         """Of each method the mean over its runs that are on this disk."""
         spent: Dict[str, List[float]] = {}
         for path in (self.scene.output_dir / self.scene.name).glob(f"*/*/{SECONDS_FILE}"):
-            record = json.loads(path.read_text())
+            record = _spent(path)
             spent.setdefault(path.parents[1].name, []).append(record["seconds"] / record["iterations"])
         return {method: sum(rates) / len(rates) for method, rates in spent.items()}
 
@@ -243,9 +244,17 @@ class Laboratory:
 
     @staticmethod
     def _record(path: Path, seconds: float, iterations: int) -> None:
-        before = json.loads(path.read_text()) if path.is_file() else {"seconds": 0.0, "iterations": 0}
+        before = _spent(path)
         record = {"seconds": before["seconds"] + seconds, "iterations": before["iterations"] + iterations}
-        path.write_text(json.dumps(record) + "\n")
+        write_whole(path, json.dumps(record) + "\n")
+
+
+def _spent(path: Path) -> Dict[str, float]:
+    """Seconds and iterations that a run has taken so far; nothing where no file, or no JSON, says."""
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {"seconds": 0.0, "iterations": 0}
 
 
 def last_words(log: str) -> str:

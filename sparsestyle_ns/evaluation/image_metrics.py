@@ -47,14 +47,18 @@ def _load_lpips(weights: Path) -> Callable[[Tensor, Tensor], Tensor]:
     return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
 
 
+def has_lpips() -> bool:
+    """Whether the weights that LPIPS needs are in the torch hub cache."""
+    return (hub_folder() / ALEXNET_FILE).is_file()
+
+
 def lpips_metric(size: Tuple[int, ...]) -> Optional[Callable[[Tensor, Tensor], Tensor]]:
     """LPIPS with AlexNet for pictures of a height and width, on the CPU.
 
     None where these are too small, or the network's weights are not in the torch hub cache. torchmetrics would download
     them; measuring a picture must not depend on a network.
     """
-    path = hub_folder() / ALEXNET_FILE
-    return _load_lpips(path) if path.is_file() and min(size) >= MIN_LPIPS_SIDE else None
+    return _load_lpips(hub_folder() / ALEXNET_FILE) if has_lpips() and min(size) >= MIN_LPIPS_SIDE else None
 
 
 class ShiftTolerantLPIPS:

@@ -19,14 +19,15 @@ from sparsestyle_ns.evaluation.art_fid import ArtFID, missing_weights
 from sparsestyle_ns.evaluation.camera_path import measuring_path
 from sparsestyle_ns.evaluation.experiments import Experiment, SceneSettings
 from sparsestyle_ns.evaluation.held_out import evaluate_run, saved_report, stylisation_figures
-from sparsestyle_ns.evaluation.image_metrics import image_metrics
+from sparsestyle_ns.evaluation.image_metrics import has_lpips, image_metrics
 from sparsestyle_ns.evaluation.path_frames import PathFrames, render_path
 from sparsestyle_ns.evaluation.style_strength import gram_matrix
+from sparsestyle_ns.files import write_whole
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.progress import track
 from sparsestyle_ns.run_folder import REPORT_FILE, load_run
 from sparsestyle_ns.style.targets import StyleTargets
-from sparsestyle_ns.style.vgg import can_load_backbone
+from sparsestyle_ns.style.vgg import available_backbone
 
 HIGH_FREQUENCIES = (
     *("--pipeline.model.coarse-field.num-levels", "10"),
@@ -79,6 +80,8 @@ STYLE_KINDS: Dict[str, Tuple[str, ...]] = {
 }
 """Stage 2: as it is; the coarse field itself fine-tuned, as ARF does, at stage 1's learning rate and with the content
 weight that ours ends with; and the paper's ablations."""
+EVERY_LOSS = ("--logging.steps-per-log", "1")
+"""Plots of the losses take those of every iteration."""
 STOPS = (20, 100)
 """Iterations after which the paper shows what different content weights have done (Fig. 7 a)."""
 MEASURED_FOLDER = "measured"
@@ -97,6 +100,7 @@ class Study:
         style_flags: settings of all stylised runs, after their kind's.
         coarse_iterations: of stage 1; None for the method's own.
         style_iterations: of stage 2; None for the method's own.
+        backbone: the feature network of all runs, unless their flags name weights; None where there is none.
     """
 
     scene: SceneSettings
@@ -105,18 +109,24 @@ class Study:
     style_flags: Tuple[str, ...] = ()
     coarse_iterations: Optional[int] = None
     style_iterations: Optional[int] = None
+    backbone: Optional[str] = field(default_factory=available_backbone)
 
     def coarse_kinds(self) -> Tuple[str, ...]:
         """The kinds of stage 1 that can be trained here: without weights of a feature network, not `dietnerf`."""
-        names_weights = any("vgg-weights" in flag.replace("_", "-") for flag in self.coarse_flags)
-        found = names_weights or can_load_backbone()
+        found = self.backbone is not None or _names_weights(self.coarse_flags)
         return tuple(kind for kind in COARSE_KINDS if found or kind != "dietnerf")
+
+    def _backbone_flags(self, flags: Sequence[str]) -> Tuple[str, ...]:
+        """One network for all runs, whatever can be downloaded by the time that they begin."""
+        return () if self.backbone is None or _names_weights(flags) else ("--backbone", self.backbone)
 
     def coarse(self, kind: str) -> Experiment:
         """The experiment of stage 1 of a kind."""
         method = "coarse-fewshot-draft" if self.draft else "coarse-fewshot"
         iterations = self.coarse_iterations or method_config(method).max_num_iterations
-        return Experiment(kind, method, iterations, (*COARSE_KINDS[kind], *SCENE_KINDS[kind], *self.coarse_flags))
+        network = self._backbone_flags(self.coarse_flags) if kind == "dietnerf" else ()
+        flags = (*COARSE_KINDS[kind], *SCENE_KINDS[kind], *network, *self.coarse_flags)
+        return Experiment(kind, method, iterations, flags)
 
     def stylised(self, painting: Path, style_kind: str = "ours", coarse_kind: str = "ours") -> Experiment:
         """The experiment of stage 2 of a kind, on a coarse field of a kind."""
@@ -127,11 +137,21 @@ class Study:
             name=f"{coarse_kind}-{style_kind}-{painting.stem}",
             method=method,
             iterations=iterations,
-            flags=(*STYLE_KINDS[style_kind], *SCENE_KINDS[coarse_kind], *self.style_flags),
+            flags=(
+                *STYLE_KINDS[style_kind],
+                *SCENE_KINDS[coarse_kind],
+                *EVERY_LOSS,
+                *self._backbone_flags(self.style_flags),
+                *self.style_flags,
+            ),
             painting=painting,
             coarse=self.coarse(coarse_kind),
             stops=tuple(stop for stop in STOPS if stop < iterations) if with_pictures else (),
         )
+
+
+def _names_weights(flags: Sequence[str]) -> bool:
+    return any("vgg-weights" in flag.replace("_", "-") for flag in flags)
 
 
 @dataclass
@@ -139,7 +159,7 @@ class Measured:
     """What a row of a table shows.
 
     Attributes:
-        figures: as `PathFrames.figures` and `stylisation_figures` name them, and `content_ssim` to unstylised frames.
+        figures: as `PathFrames.figures` and `stylisation_figures` name them, and `unstylised_ssim`.
         pictures: PNG files of the path's first, middle and last frame.
         coarse_pictures: the same, unstylised.
     """
@@ -173,7 +193,7 @@ class Painter:
             figures = stylisation_figures(
                 self._targets, self._gram, coarse, stylised, frames.surfaces[index].covered.float()
             )
-            values.append({**figures, "content_ssim": image_metrics(stylised, coarse)["ssim"]})
+            values.append({**figures, "unstylised_ssim": image_metrics(stylised, coarse)["ssim"]})
             if art_fid is not None:
                 art_fid.add(stylised, coarse)
         means = {key: sum(value[key] for value in values) / len(values) for key in values[0]}
@@ -218,7 +238,9 @@ def measure_frames_of_2d(
 def measure_coarse(folder: Path) -> Dict[str, float]:
     """A coarse run's figures on its held-out views, kept beside it."""
     known = saved_report(folder, _newest_step(folder))
-    return known.means if known is not None else evaluate_run(folder / "config.yml", folder / REPORT_FILE).means
+    if known is not None and ("lpips" in known.means or not has_lpips()):
+        return known.means
+    return evaluate_run(folder / "config.yml", folder / REPORT_FILE).means
 
 
 def _newest_step(folder: Path) -> int:
@@ -236,16 +258,23 @@ def _measure(folder: Path, step: int, frames: PathFrames, painter: Painter, sett
         save_png(frames.stylised[index], folder / f"stylised-{place}.png")
         save_png(frames.coarse[index], folder / f"coarse-{place}.png")
     # Last, so that a folder with figures is a whole one.
-    (folder / "figures.json").write_text(json.dumps({"step": step, "figures": figures}, indent=1) + "\n")
+    write_whole(folder / "figures.json", json.dumps({"step": step, "figures": figures}, indent=1) + "\n")
     return Measured(figures, *_pictures(folder))
 
 
 def _read(folder: Path, step: int) -> Optional[Measured]:
+    """What was measured, if it is of that iteration and nothing can be measured by now that couldn't be then."""
     path = folder / "figures.json"
-    content = json.loads(path.read_text()) if path.is_file() else {"step": None}
-    if content["step"] != step or not ("art_fid" in content["figures"] or missing_weights()):
+    try:
+        content = json.loads(path.read_text()) if path.is_file() else {"step": None}
+    except ValueError:  # no JSON
         return None
-    return Measured(content["figures"], *_pictures(folder))
+    if content["step"] != step:
+        return None
+    figures = content["figures"]
+    if not ("art_fid" in figures or missing_weights()) or ("short_lpips" not in figures and has_lpips()):
+        return None
+    return Measured(figures, *_pictures(folder))
 
 
 def _pictures(folder: Path) -> Tuple[List[Path], List[Path]]:

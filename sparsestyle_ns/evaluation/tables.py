@@ -23,10 +23,11 @@ LABELS: Dict[str, Tuple[str, int]] = {
     "art_fid": ("ArtFID ↓", 2),
     "content_loss": ("feature distance to the content ↓", 3),
     "content_ssim": ("SSIM to the photo ↑", 3),
+    "unstylised_ssim": ("SSIM to the unstylised frame ↑", 3),
     "baked_psnr": ("baked to exact, PSNR dB ↑", 1),
 }
 """A figure's name in words, with the direction that is better, and its decimals."""
-STYLE_AND_CONTENT = ("style_loss", "gram_distance", "art_fid", "content_loss", "content_ssim")
+STYLE_AND_CONTENT = ("style_loss", "gram_distance", "art_fid", "content_loss")
 PERCEPTUAL = ("rmse", "ssim", "lpips", "st_lpips")
 
 
@@ -108,7 +109,7 @@ def report_tables(means: Dict[str, float], num_views: int) -> List[Table]:
     tables = [table_of(f"Coarse field, {views}", [(f"{prefix}{k}", k, "") for k in quality], [("coarse", means)])]
     if not prefix:
         return tables
-    kept = [(key, key, "") for key in (*STYLE_AND_CONTENT, "baked_psnr")]
+    kept = [(key, key, "") for key in (*STYLE_AND_CONTENT, "content_ssim", "baked_psnr")]
     before = {key: means.get(f"{key}_before") for key in ("style_loss", "gram_distance")}
     rows = [("unstylised", before), ("stylised", means)]
     tables.append(table_of(f"Style and content, {views}", kept, rows, why_left_out(means)))

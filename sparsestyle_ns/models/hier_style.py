@@ -17,7 +17,7 @@ from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.field_components.point_encodings import FrequencyEncoding, NoEncoding, PointEncoding
-from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid
+from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid, has_tiny_cuda_nn
 from sparsestyle_ns.fields.fine_tuned import FineTunedField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
@@ -62,9 +62,10 @@ class HierStyleModelConfig(ModelConfig):
     stylised_field: Literal["residual", "coarse"] = "residual"
     """What is stylised: the residual field on the frozen coarse one (Eq. 2 and 3), or a copy of the coarse field
     itself, fine-tuned as ARF does; then the settings of the residual field mean nothing."""
-    fine_encoding: Literal["hash", "tiny-cuda-nn", "frequency", "none"] = "hash"
-    """What the residual field sees of a position beside e_c: the hash grid ψ(x), that of tiny-cuda-nn (on a GPU, where
-    it is installed; the run opens only there), sines and cosines of `frequency_levels` octaves, or nothing."""
+    fine_encoding: Literal["auto", "hash", "tiny-cuda-nn", "frequency", "none"] = "auto"
+    """What the residual field sees of a position beside e_c: the hash grid ψ(x) with our kernels, or as tiny-cuda-nn
+    has it, which auto takes on a GPU where that library is installed; sines and cosines of `frequency_levels` octaves;
+    or nothing."""
     frequency_levels: int = 10
     """Octaves of the sines and cosines, where they take the hash grid's place."""
     hash_levels: int = 8
@@ -136,6 +137,9 @@ class HierStyleModel(Model):
         metadata: Dict[str, Any] = self.kwargs["metadata"]
         effects: Decisions = metadata["effects"]
         config = self.config
+        if config.fine_encoding == "auto":  # kept in the config, so that a run is opened as what it was trained as
+            is_there = has_tiny_cuda_nn(self._built_for(), config.features_per_level)
+            config.fine_encoding = "tiny-cuda-nn" if is_there else "hash"
         self.space = effects.build_space(scene_box=self.scene_box, metadata=metadata)
         self.field = config.coarse_field.setup(effects).requires_grad_(False)
         residual = config.stylised_field == "residual"
@@ -184,14 +188,20 @@ class HierStyleModel(Model):
             return NoEncoding()
         if config.fine_encoding == "frequency":
             return FrequencyEncoding(config.frequency_levels)
-        grid = TinyCudaGrid if config.fine_encoding == "tiny-cuda-nn" else HashGrid
-        return grid(
+        shape = (
             config.hash_levels,
             config.min_resolution,
             config.max_resolution,
             config.features_per_level,
             config.log2_table_size,
         )
+        if config.fine_encoding == "tiny-cuda-nn":
+            return TinyCudaGrid(*shape, device=self._built_for())
+        return HashGrid(*shape)
+
+    def _built_for(self) -> torch.device:
+        """The device that the pipeline names when it has the model made."""
+        return torch.device(self.kwargs.get("device", "cpu"))
 
     def _fine_tuned_field(self, effects: Decisions) -> FineTunedField:
         return FineTunedField(self.config.coarse_field.setup(effects))

@@ -15,6 +15,8 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from sparsestyle_ns.progress import track
+
 COMPARED_SIDE = 1000
 """Pixels along the longer side of the pictures that are compared, at most."""
 MAX_FEATURES = 4000
@@ -74,7 +76,7 @@ def check_photos(images: Sequence[Image.Image], names: Sequence[str]) -> List[st
     features = [find_features(image) for image in small]
     pairs = {
         (first, second): compare(features[first], features[second], small[0].shape)
-        for first, second in combinations(range(len(images)), 2)
+        for first, second in track(list(combinations(range(len(images)), 2)), "Comparing photos")
     }
     return [*_faint(features, names), *_unlinked(pairs, names), *_without_depth(pairs, names)]
 

@@ -88,11 +88,17 @@ class VGGFeatures(nn.Module):
     Args:
         description: which of the two networks this is, and its origin.
         trunk: its parameters and buffers, named as in this module.
+        memory_format: how its feature maps lie in memory.
     """
 
-    def __init__(self, description: Backbone, trunk: dict[str, Tensor]) -> None:
+    def __init__(
+        self,
+        description: Backbone,
+        trunk: dict[str, Tensor],
+        memory_format: torch.memory_format = torch.channels_last,
+    ) -> None:
         super().__init__()
-        self.description = description
+        self.description, self.memory_format = description, memory_format
         # Built without storage: the weights come from `trunk`, and torch's random state stays untouched.
         with torch.device("meta"):
             self.blocks = nn.ModuleList(
@@ -108,7 +114,7 @@ class VGGFeatures(nn.Module):
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
         self.requires_grad_(False)
         self.eval()
-        self.to(memory_format=torch.channels_last)
+        self.to(memory_format=memory_format)
 
     def forward(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 768 h w"]:
         """relu3_1, relu3_2 and relu3_3, joined in this order.
@@ -119,7 +125,7 @@ class VGGFeatures(nn.Module):
         Returns:
             Features, 0 or more; h = ⌊⌊H/2⌋/2⌋ for `vgg16`, ⌊(⌊H/2⌋ + 1)/2⌋ + 1 for `vgg16-shift-tolerant`.
         """
-        maps = ((images - self.mean) / self.std).contiguous(memory_format=torch.channels_last)
+        maps = ((images - self.mean) / self.std).contiguous(memory_format=self.memory_format)
         for block, pool in zip(self.blocks[:-1], self.pools, strict=True):
             for convolution in block:
                 maps = F.relu(convolution(maps))
@@ -153,13 +159,13 @@ def load_backbone(
     return VGGFeatures(Backbone(name=name, source=source, sha256=_sha256(path)), trunk)
 
 
-def can_load_backbone() -> bool:
-    """Whether `load_backbone()` finds weights, or, where it would have to, can download them."""
+def available_backbone() -> Optional[str]:
+    """The name of the network that `load_backbone()` gives; None where no weights are found or can be downloaded."""
     try:
-        _find_weights("auto", None)
+        path, _ = _find_weights("auto", None)
     except InputError:
-        return False
-    return True
+        return None
+    return SHIFT_TOLERANT if path == _packaged_weights() else PLAIN
 
 
 def _find_weights(backbone: str, weights: Optional[Path]) -> tuple[Path, str]:

@@ -211,6 +211,7 @@ class Restyling:
             "backbone": asdict(self.workshop.backbone().description),
             "coarse_run": str(self.config.pipeline.coarse_run),
             "coarse_field": asdict(self.config.pipeline.model.coarse_field),
+            "fine_encoding": self.config.pipeline.model.fine_encoding,
         }
 
 

@@ -25,6 +25,7 @@ from sparsestyle_ns.evaluation.ablations import (
     ablation_groups,
     annealing_plots,
     moving_mean,
+    smoothing,
 )
 from sparsestyle_ns.evaluation.comparison import PAPER_ROWS, comparison_experiments
 from sparsestyle_ns.evaluation.experiments import Experiment, Laboratory, SceneSettings
@@ -53,7 +54,8 @@ def test_the_comparisons_runs_are_ours_arfs_kind_and_freenerfs(painting: Path) -
     assert arf["--pipeline.model.stylised-field"] == "coarse"
     assert arf["--pipeline.content-decay"] == "1"
     assert flags_of(runs[1].coarse)["--pipeline.model.frequency-reveal"] == "0.9"
-    assert runs[2].flags == runs[2].coarse.flags == ()
+    assert runs[2].coarse.flags == ()
+    assert flags_of(runs[2]) == {"--logging.steps-per-log": "1", "--backbone": "vgg16-shift-tolerant"}
 
 
 def test_each_ablation_of_the_paper_is_a_run_and_none_is_done_twice(painting: Path) -> None:
@@ -107,9 +109,11 @@ def test_every_flag_of_every_kind_is_one_that_ns_train_knows(llff_scene: Path, p
     assert parsed["freenerf"].pipeline.model.occlusion_weight > 0 == parsed["vanilla"].pipeline.model.occlusion_weight
     settings = {kind: parsed[f"ours-{kind}-{painting.stem}"].pipeline for kind in STYLE_KINDS}
     encodings = {kind: config.model.fine_encoding for kind, config in settings.items()}
-    assert encodings == {**dict.fromkeys(STYLE_KINDS, "hash"), "ec-only": "none", "frequency": "frequency"}
+    assert encodings == {**dict.fromkeys(STYLE_KINDS, "auto"), "ec-only": "none", "frequency": "frequency"}
     assert [kind for kind, config in settings.items() if config.model.stylised_field == "coarse"] == ["arf"]
     assert [kind for kind, config in settings.items() if config.effects.residual_density == "off"] == ["coarse-density"]
+    assert all(parsed[each.name].logging.steps_per_log == 1 for each in runs)
+    assert {parsed[each.name].pipeline.backbone for each in runs} == {Study(scene).backbone} == {"vgg16-shift-tolerant"}
     assert [settings[f"lambda-{w}"].content_weight for w in ("10", "1", "0.1")] == [10.0, 1.0, 0.1]
 
 
@@ -204,7 +208,7 @@ def test_figures_are_measured_again_when_a_run_has_gone_on(
     whole = Study(scene, False, tuple(TINY), tuple(TINY_STYLE), 2, 2).stylised(painting)
     Laboratory(scene, 1).run([whole])
     first = measure_run(whole.folder(scene), Painter(painting))
-    assert {"short_rmse", "long_ssim", "ceiling_short_rmse", "style_loss", "gram_distance", "content_ssim"} <= set(
+    assert {"short_rmse", "long_ssim", "ceiling_short_rmse", "style_loss", "gram_distance", "unstylised_ssim"} <= set(
         first.figures
     )
     assert len(first.pictures) == len(first.coarse_pictures) == 3
@@ -212,6 +216,8 @@ def test_figures_are_measured_again_when_a_run_has_gone_on(
     record = whole.folder(scene) / MEASURED_FOLDER / "figures.json"
     content = json.loads(record.read_text())
     record.write_text(json.dumps({**content, "step": 0, "figures": {}}))
+    assert measure_run(whole.folder(scene), Painter(painting)).figures == pytest.approx(first.figures)
+    record.write_text("cut sh")
     assert measure_run(whole.folder(scene), Painter(painting)).figures == pytest.approx(first.figures)
 
 
@@ -258,7 +264,8 @@ def test_traces_are_averaged_over_the_last_iterations() -> None:
 
 def test_annealing_is_plotted_as_the_way_of_both_losses_and_each_by_iteration() -> None:
     traces = {name: {loss: ([0, 1, 2], [3.0, 2.0, 1.0]) for loss in ("content", "style")} for name in ("ours", "λ = 1")}
-    plots = annealing_plots(traces)
+    assert [smoothing(views) for views in (1, 3, 5, 8, 20)] == [9, 9, 10, 8, 20]
+    plots = annealing_plots(traces, 2)
     assert len(plots) == 3
     assert all(svg.lstrip().startswith("<?xml") and "<svg" in svg for svg, _ in plots)
 

@@ -53,7 +53,7 @@ COVERED = set()
 ELSEWHERE = {
     "sparsestyle_ns.field_components.hash_grid_triton": "needs CUDA or Triton's interpreter: test_hash_grid.py",
     "sparsestyle_ns.rendering.baked_kernels.march_rays": "is what march_compiled calls",
-    "sparsestyle_ns.style.vgg.can_load_backbone": "takes no input: test_studies.py",
+    "sparsestyle_ns.style.vgg.available_backbone": "takes no input: test_studies.py",
     "sparsestyle_ns.rendering.baked.march_compiled": "is what render_baked calls on a CPU",
 }
 """Modules and functions without a property of their own, and why."""

@@ -6,9 +6,14 @@ import torch
 from conftest import decided
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.field_components import encodings
 from torch.nn.functional import normalize
 
 from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.field_components.hash_grid import HashGrid
+from sparsestyle_ns.field_components.point_encodings import NoEncoding
+from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid
+from sparsestyle_ns.models import hier_style
 from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
 from sparsestyle_ns.models.hier_style import MOST_BAKED, HierStyleModelConfig, Look
 from sparsestyle_ns.rendering.mixing import Mix
@@ -30,7 +35,7 @@ def make_model(effects=SPARE, **settings):
     return model
 
 
-def make_untrained(effects=SPARE, seed=0, **settings):
+def make_untrained(effects=SPARE, seed=0, device="cpu", **settings):
     torch.manual_seed(seed)
     config = HierStyleModelConfig(
         coarse_field=CoarseFieldConfig(
@@ -52,7 +57,7 @@ def make_untrained(effects=SPARE, seed=0, **settings):
         **settings,
     )
     metadata = {"effects": decided(*effects, background={"color": [1.0, 0.5, 0.0]})}
-    return config.setup(scene_box=BOX, num_train_data=1, metadata=metadata).eval()
+    return config.setup(scene_box=BOX, num_train_data=1, metadata=metadata, device=device).eval()
 
 
 @pytest.fixture
@@ -185,6 +190,24 @@ def test_the_residual_field_sees_what_the_config_says_beside_the_coarse_feature(
     assert model.residual.mlp.layers[0].in_features == numbers + 4
     assert any("table" in name for name in model.state_dict()) == (encoding == "hash")
     assert render(model, "exact")["rgb"].isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "installed, device, chosen", [(True, "cuda", "tiny-cuda-nn"), (True, "cpu", "hash"), (False, "cuda", "hash")]
+)
+def test_the_hash_grid_is_tiny_cuda_nns_on_a_gpu_where_it_is_installed_and_the_config_keeps_that(
+    monkeypatch, installed, device, chosen
+):
+    monkeypatch.setattr(encodings, "TCNN_EXISTS", installed)
+    assert HierStyleModelConfig().fine_encoding == "auto"
+    built = []
+    for name in ("TinyCudaGrid", "HashGrid"):
+        kind = getattr(hier_style, name)
+        monkeypatch.setattr(hier_style, name, lambda *shape, kind=kind, **at: built.append((kind, at)) or NoEncoding())
+    model = make_untrained(device=device)
+    assert model.config.fine_encoding == chosen
+    expected = (TinyCudaGrid, {"device": torch.device(device)}) if chosen == "tiny-cuda-nn" else (HashGrid, {})
+    assert built == [expected]
 
 
 def test_a_picture_in_one_mode_leaves_the_models_own_as_it_was(model):
