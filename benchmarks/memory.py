@@ -77,6 +77,7 @@ def main(options: MemoryOptions) -> None:
             Ratio(LIMIT / peaks[-1], (LIMIT / peaks[-1], LIMIT / peaks[0])),
             1.0,
             bytes=peaks[-1],
+            timed=False,
         )
     report.write()
 

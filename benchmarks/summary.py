@@ -66,7 +66,7 @@ def table(rows: List[Dict[str, Any]]) -> str:
 
 
 def _remarks(row: Dict[str, Any]) -> List[str]:
-    remarks = ["**machine was busy**"] if row["busy"] else []
+    remarks = ["**machine was busy**"] if row["busy"] and row.get("timed", True) else []
     if "bytes" in row:
         peer = f" against {row['against_bytes'] / 1e9:.2f}" if "against_bytes" in row else ""
         remarks.append(f"peak {row['bytes'] / 1e9:.2f}{peer} GB")

@@ -207,6 +207,12 @@ def test_a_lower_bound_below_the_target_is_not_called_a_miss(options, tmp_path):
     assert "not known" in summary.table([row])
 
 
+def test_memory_is_as_good_from_a_busy_machine():
+    row = {"busy": True, "bytes": 6_500_000_000}
+    assert summary._remarks({**row, "timed": False}) == ["peak 6.50 GB"]
+    assert summary._remarks(row) == ["**machine was busy**", "peak 6.50 GB"]
+
+
 def test_summary_of_nothing_says_so(options):
     with pytest.raises(SystemExit, match="There are no results in"):
         summary.main(options)

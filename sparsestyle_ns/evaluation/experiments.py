@@ -152,21 +152,30 @@ class Laboratory:
         styled = list(dict.fromkeys(experiments))
         coarse = list(dict.fromkeys(each.coarse for each in styled if each.coarse is not None))
         wanted = [*coarse, *(each for each in styled if each not in coarse)]
-        left = [each for each in wanted if not each.is_finished(self.scene)]
+        left = self._unfinished(wanted)
         self.say(self.forecast(wanted, left))
+
+        def train(each: Experiment, jobs: int) -> None:
+            self._train(each, jobs, after_stop)
+            if still := self._unfinished(wanted):
+                self.say(self.forecast(wanted, still))
+
         for stage in (coarse, styled):
             todo = [each for each in stage if each in left]
             jobs = min(self._jobs(), len(todo))
             if jobs < 2:
                 for each in todo:
-                    self._train(each, 1, after_stop)
+                    train(each, 1)
                 continue
             with ThreadPoolExecutor(jobs) as pool:
                 try:
-                    list(pool.map(lambda each, jobs=jobs: self._train(each, jobs, after_stop), todo))
+                    list(pool.map(lambda each, jobs=jobs: train(each, jobs), todo))
                 except BaseException:
                     pool.shutdown(cancel_futures=True)
                     raise
+
+    def _unfinished(self, experiments: Sequence[Experiment]) -> List[Experiment]:
+        return [each for each in experiments if not each.is_finished(self.scene)]
 
     def forecast(self, wanted: Sequence[Experiment], left: Sequence[Experiment]) -> str:
         """How much is to do and how long it will take, by what earlier runs of the same methods took."""

@@ -124,6 +124,13 @@ def test_how_long_it_takes_is_told_from_earlier_runs_alone(laboratory: Laborator
     assert "1 take about 2:00 min, as earlier runs did." in laboratory.forecast([COARSE], [COARSE])
 
 
+def test_what_is_left_is_told_after_each_run(laboratory: Laboratory) -> None:
+    laboratory.run([STYLE, Experiment("ours-arf", "hier-style", 6, ("--flag",), coarse=COARSE)])
+    told = [line for line in laboratory.said if line.startswith("3 runs")]
+    assert [line[:27] for line in told] == [f"3 runs, {done} of them finished." for done in range(3)]
+    assert "known once the first" in told[1] and "1 take about" in told[2]
+
+
 def test_time_spent_is_kept_beside_the_run(laboratory: Laboratory) -> None:
     laboratory.run([STYLE])
     record = json.loads((STYLE.folder(laboratory.scene) / SECONDS_FILE).read_text())
