@@ -70,8 +70,11 @@ def check_lenses(path: Path, content: Dict[str, Any]) -> None:
         if ANGLE in given:
             _check_angle(where, given[ANGLE])
         lens = given.get("distortion_params", [0.0] * 6)
-        if not isinstance(lens, list) or len(lens) != 6 or any(math.isnan(_number(value)) for value in lens):
-            raise InputError(f"{where} has distortion_params {_shown(lens)}: give six numbers, or take it out.")
+        if not isinstance(lens, list) or len(lens) not in (6, 12) or any(math.isnan(_number(value)) for value in lens):
+            raise InputError(
+                f"{where} has distortion_params {_shown(lens)}: give six numbers, twelve of a FISHEYE624, or take it "
+                "out."
+            )
 
 
 def _check_angle(where: str, angle: Any) -> None:
