@@ -370,7 +370,10 @@ def prepare(
     output: Path,
     poses: Literal["auto", "file", "colmap"] = "auto",
 ) -> None:
-    """Makes a scene of three to eight photos: upright, of one size, and with the places they were taken from.
+    """Makes a scene of three to eight photos: of one size, and with the places they were taken from.
+
+    Photos are turned upright as EXIF says. With poses from a file they stay as they are stored, which such poses are
+    for, unless only the upright photo has the pose's shape.
 
     Says in words what is wrong with the photos: too few features or matches, too little overlap, a camera that only
     turned, or only moved along its line of sight.

@@ -19,7 +19,7 @@ from nerfstudio.data.utils.dataloaders import RandIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from sparsestyle_ns.dataparsers.transforms import check_transforms
+from sparsestyle_ns.dataparsers.transforms import read_transforms
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.matched_depth import MatchedRays
 from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings, decide
@@ -214,11 +214,12 @@ def read_scene(parser: DataParser, split: str = "train", **kwargs: Any) -> Datap
     config = parser.config
     name = type(config).__name__.removesuffix("DataParserConfig").lower()
     if isinstance(config, BlenderDataParserConfig):
-        frames = check_transforms(config.data / f"transforms_{split}.json", with_angle=True)
-        open_photo(config.data / f"{frames[0].replace('./', '')}.png")  # gives all cameras of the split their size
+        frames = read_transforms(config.data / f"transforms_{split}.json", with_angle=True)["frames"]
+        first = frames[0]["file_path"].replace("./", "")
+        open_photo(config.data / f"{first}.png")  # gives all cameras of the split their size
     elif isinstance(config, NerfstudioDataParserConfig):
         is_file = config.data.suffix == ".json"
-        check_transforms(config.data if is_file else config.data / "transforms.json", with_angle=False)
+        read_transforms(config.data if is_file else config.data / "transforms.json", with_angle=False)
     try:
         outputs = DataParser.get_dataparser_outputs(parser, split, **kwargs)
     except InputError:

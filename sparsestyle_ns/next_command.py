@@ -1,4 +1,4 @@
-"""The last line of every command: what it has made, and what to type next."""
+"""The last line of this package's commands: what was made, and what to type next."""
 
 import shlex
 import sys

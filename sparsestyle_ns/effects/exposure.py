@@ -1,6 +1,6 @@
 """Photos that differ by a gain: exposure and white balance, three numbers a photo."""
 
-from typing import Any, Dict, List, Tuple
+from typing import Any, Dict, List, Optional, Tuple
 
 import numpy as np
 import torch
@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from sparsestyle_ns.effects.base import Effect, Measurement
-from sparsestyle_ns.effects.matches import PointMatches
+from sparsestyle_ns.effects.matches import PointMatches, why_unmatched
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_STOPS = 0.1
@@ -42,6 +42,15 @@ def fit_gains(matches: PointMatches) -> Tuple[Float[np.ndarray, "views 3"], Floa
             error = np.abs(target - design @ gains[:, channel])
             weights[:-1] = 1.0 / np.sqrt(np.maximum(error[:-1], ROBUST))
     return gains, ratios - design[:-1] @ gains
+
+
+def not_measurable(scene: Scene) -> Optional[str]:
+    """Why photos' colours can't be compared by matched points, in words; None where they can."""
+    fewest = scene.matches.fewest_in_a_view()
+    if fewest >= MIN_MATCHES:
+        return None
+    reason = why_unmatched(scene.cameras) or f"a photo has {fewest} matched points, fewer than {MIN_MATCHES}"
+    return f"not measurable: {reason}"
 
 
 class ExposureCorrection(nn.Module):
@@ -88,11 +97,9 @@ class Exposure(Effect):
 
     def measure(self, scene: Scene) -> Measurement:
         """See `Effect.measure`; the largest gain of a photo against the mean, in stops, from matched points."""
-        fewest = scene.matches.fewest_in_a_view()
-        if fewest < MIN_MATCHES:
-            return Measurement(
-                False, f"not measurable: a photo has {fewest} matched points, fewer than {MIN_MATCHES}", None, MIN_STOPS
-            )
+        unknown = not_measurable(scene)
+        if unknown:
+            return Measurement(False, unknown, None, MIN_STOPS)
         gains, _ = fit_gains(scene.matches)
         stops = float(np.abs(gains).max() / np.log(2.0))
         words = f"stops at most between a photo and the mean, by {len(scene.matches)} matched points"

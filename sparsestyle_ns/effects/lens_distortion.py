@@ -4,7 +4,7 @@ from typing import Any, Dict, List, Optional
 
 import numpy as np
 from jaxtyping import Float
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from sparsestyle_ns.effects.base import Effect, Measurement
@@ -44,6 +44,8 @@ class LensDistortion(Effect):
         if scene.cameras.distortion_params is None:
             words = "the cameras have no distortion parameters"
             return Measurement(False, words, 0.0, MIN_PIXELS, possible=False)
+        if (scene.cameras.camera_type == CameraType.FISHEYE624.value).any():
+            return Measurement(True, "such cameras' rays are made of their distortion parameters", None, MIN_PIXELS)
         shift = largest_shift(scene.cameras)
         return Measurement(shift >= MIN_PIXELS, "pixels at most by which the lens moves a point", shift, MIN_PIXELS)
 

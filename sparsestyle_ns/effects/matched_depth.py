@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestyle_ns.effects.base import Effect, Measurement
-from sparsestyle_ns.effects.matches import distances_along
+from sparsestyle_ns.effects.matches import distances_along, why_unmatched
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_POINTS = 100
@@ -64,6 +64,9 @@ class MatchedDepth(Effect):
 
     def measure(self, scene: Scene) -> Measurement:
         """See `Effect.measure`; how many points of a photo, on average, are matched and triangulated."""
+        unmatched = why_unmatched(scene.cameras)
+        if unmatched:
+            return Measurement(False, f"not measurable: {unmatched}", None, float(MIN_POINTS), possible=False)
         count = len(matched_rays(scene)) / max(1, len(scene.matched_views))
         words = "points of a photo are seen by another, so that their depth is known"
         return Measurement(count >= MIN_POINTS, words, count, float(MIN_POINTS), possible=count > 0)

@@ -11,8 +11,10 @@ from typing import List, Optional, Sequence, Tuple
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float, Int
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.camera_utils import radial_and_tangential_undistort
+from nerfstudio.cameras.cameras import Cameras, CameraType
 
 MAX_KEYPOINTS = 2000
 MAX_RATIO = 0.8
@@ -21,8 +23,8 @@ MAX_EPIPOLAR_ERROR = 1.0
 """Sampson distance, in pixels, up to which a match obeys the cameras."""
 BLUR = 2.0
 """Standard deviation, in pixels, of the blur under which colours are taken."""
-UNTIL_EXACT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
-"""When OpenCV has inverted a lens; its usual five steps leave an error."""
+LENSES = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
+"""Kinds of cameras whose directions are known here; photos of others aren't matched."""
 NEAREST_VIEWS = 6
 """Photos that each photo is matched with: those whose cameras look most nearly the same way."""
 
@@ -61,15 +63,32 @@ class PointMatches:
 
 
 @dataclass
+class Rays:
+    """Directions of image points in a camera.
+
+    Attributes:
+        directions: right, up and back, of any length.
+        tangents: how they change with the image point over the focal length, to the right and down.
+    """
+
+    directions: Float[np.ndarray, "points 3"]
+    tangents: Float[np.ndarray, "points 3 2"]
+
+    def __getitem__(self, index: Int[np.ndarray, "some"]) -> "Rays":
+        """Some of them."""
+        return Rays(self.directions[index], self.tangents[index])
+
+
+@dataclass
 class _Keypoints:
     points: Float[np.ndarray, "points 2"]
-    rays: Float[np.ndarray, "points 3"]
+    rays: Rays
     descriptors: Float[np.ndarray, "points 128"]
     scale: float
 
 
 def match_points(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras) -> PointMatches:
-    """Finds points that two photos see; only where both photos are opaque.
+    """Finds points that two photos see; only where both photos are opaque, and by cameras that are `LENSES`.
 
     Args:
         photos: RGBA in [0, 1].
@@ -88,7 +107,10 @@ def match_points(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras)
         fits = error < MAX_EPIPOLAR_ERROR * max(one.scale, other.scale)
         here, there = here[fits], there[fits]
         colors = sample(blurred[first], one.points[here]), sample(blurred[second], other.points[there])
-        directions = in_world(one.rays[here], poses[first]), in_world(other.rays[there], poses[second])
+        directions = (
+            in_world(one.rays.directions[here], poses[first]),
+            in_world(other.rays.directions[there], poses[second]),
+        )
         opaque = (colors[0][:, 3] > 0.99) & (colors[1][:, 3] > 0.99)
         views = np.full(len(here), first), np.full(len(here), second)
         found.append((*(each[opaque] for each in views), *(each[opaque, :3] for each in (*colors, *directions))))
@@ -136,7 +158,10 @@ def neighbouring_pairs(poses: Float[np.ndarray, "views 3 4"]) -> List[Tuple[int,
 
 
 def find_keypoints(photo: Float[np.ndarray, "H W 4"], cameras: Cameras, index: int) -> Optional[_Keypoints]:
-    """SIFT keypoints of a photo with their directions in the camera; None where there are fewer than two."""
+    """SIFT keypoints of a photo with their rays; None where there are fewer than two, or its camera is no `LENSES`."""
+    kind = CameraType(int(cameras.camera_type[index]))
+    if kind not in LENSES:
+        return None
     grey = (255.0 * (photo[..., :3] * photo[..., 3:]).mean(axis=-1)).astype(np.uint8)
     found, descriptors = cv2.SIFT_create(nfeatures=MAX_KEYPOINTS, contrastThreshold=0.02).detectAndCompute(grey, None)
     if len(found) < 2:
@@ -145,8 +170,7 @@ def find_keypoints(photo: Float[np.ndarray, "H W 4"], cameras: Cameras, index: i
     pixels = float(cameras.width[index]) / photo.shape[1]
     at = (0.5 + points) * pixels - np.array([float(cameras.cx[index]), float(cameras.cy[index])])
     focal = np.array([float(cameras.fx[index]), float(cameras.fy[index])])
-    flat = undistorted(at / focal, cameras, index)
-    rays = np.concatenate([flat * [1.0, -1.0], -np.ones_like(flat[:, :1])], axis=-1)
+    rays = rays_of(undistorted(at / focal, cameras, index), kind)
     # Square roots of the L1-normalised descriptor: Hellinger's distance (Arandjelović and Zisserman 2012).
     descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
     return _Keypoints(points, rays, descriptors, scale=pixels / focal.mean())
@@ -155,13 +179,47 @@ def find_keypoints(photo: Float[np.ndarray, "H W 4"], cameras: Cameras, index: i
 def undistorted(points: Float[np.ndarray, "points 2"], cameras: Cameras, index: int) -> Float[np.ndarray, "points 2"]:
     """Image points over the focal length, freed from the lens's distortion.
 
-    OpenCV's radial-tangential model with k1, k2, k3, p1 and p2; nerfstudio's k4 has no place in it.
+    nerfstudio's model, by which its rays are bent: OpenCV's with k1 to k4, p1 and p2, of a fisheye in angles.
     """
     if cameras.distortion_params is None:
         return points
-    k1, k2, k3, _, p1, p2 = cameras.distortion_params[index].double().tolist()
-    lens = np.array([k1, k2, p1, p2, k3])
-    return cv2.undistortPointsIter(points[:, None], np.eye(3), lens, np.eye(3), np.eye(3), UNTIL_EXACT)[:, 0]
+    return radial_and_tangential_undistort(torch.from_numpy(points), cameras.distortion_params[index].double()).numpy()
+
+
+def rays_of(points: Float[np.ndarray, "points 2"], kind: CameraType) -> Rays:
+    """Where a camera without distortion looks.
+
+    A perspective camera's points lie on the plane at the distance 1. A fisheye's are as far from the middle as the
+    angle θ to its axis (OpenCV's equidistant projection), so the ray is (sin θ, cos θ) aside and ahead.
+
+    Args:
+        points: image points over the focal length, right and down, from the centre.
+        kind: one of `LENSES`.
+    """
+    x, y = points.T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    if kind == CameraType.PERSPECTIVE:
+        aside, slope, ahead, along = one, zero, one, zero
+    else:
+        angle = np.hypot(x, y)
+        aside, ahead = np.sinc(angle / np.pi), np.cos(angle)  # sin θ / θ
+        # Its derivative over θ, over θ once more, which is −1/3 at θ = 0.
+        near = angle < 1e-4
+        slope = np.where(near, -1.0 / 3.0, (ahead - aside) / np.where(near, 1.0, angle) ** 2)
+        along = aside
+    directions = np.stack([aside * x, -aside * y, -ahead], axis=-1)
+    right = np.stack([aside + slope * x * x, -slope * x * y, along * x], axis=-1)
+    down = np.stack([slope * x * y, -aside - slope * y * y, along * y], axis=-1)
+    return Rays(directions, np.stack([right, down], axis=-1))
+
+
+def why_unmatched(cameras: Cameras) -> Optional[str]:
+    """Why points of photos by these cameras can't be matched; None where they can."""
+    others = {CameraType(kind) for kind in cameras.camera_type.flatten().tolist()} - set(LENSES)
+    if not others:
+        return None
+    names = ", ".join(sorted(kind.name.lower() for kind in others))
+    return f"points are matched between perspective and fisheye cameras, and some here are {names}"
 
 
 def mutual_matches(
@@ -177,24 +235,27 @@ def mutual_matches(
 
 
 def epipolar_error(
-    first: Float[np.ndarray, "matches 3"],
-    second: Float[np.ndarray, "matches 3"],
+    first: Rays,
+    second: Rays,
     pose_first: Float[np.ndarray, "3 4"],
     pose_second: Float[np.ndarray, "3 4"],
 ) -> Float[np.ndarray, "matches"]:
     """Sampson's distance of matches from the epipolar geometry, in units of the focal length (Hartley and Zisserman,
-    Multiple View Geometry, Eq. 11.9).
+    Multiple View Geometry, Eq. 11.9; for a fisheye, its gradient is that over the fisheye's own image points).
 
     Args:
-        first, second: points on the plane z = −1 of each camera.
+        first, second: the matches' rays in each camera.
         pose_first, pose_second: camera to world.
     """
     rotation = pose_second[:, :3].T @ pose_first[:, :3]
     x, y, z = pose_second[:, :3].T @ (pose_first[:, 3] - pose_second[:, 3])
     essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation
-    line_second, line_first = first @ essential.T, second @ essential
-    algebraic = (second * line_second).sum(axis=-1)
-    gradient = (line_second[:, :2] ** 2).sum(axis=-1) + (line_first[:, :2] ** 2).sum(axis=-1)
+    line_second, line_first = first.directions @ essential.T, second.directions @ essential
+    algebraic = (second.directions * line_second).sum(axis=-1)
+    gradient = sum(
+        (np.einsum("mct,mc->mt", rays.tangents, line) ** 2).sum(axis=-1)
+        for rays, line in ((second, line_second), (first, line_first))
+    )
     return np.abs(algebraic) / np.sqrt(np.maximum(gradient, 1e-24))
 
 

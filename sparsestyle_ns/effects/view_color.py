@@ -5,7 +5,7 @@ from typing import Any, Dict, List
 import numpy as np
 
 from sparsestyle_ns.effects.base import Effect, Measurement
-from sparsestyle_ns.effects.exposure import DARK, MIN_MATCHES, fit_gains
+from sparsestyle_ns.effects.exposure import DARK, fit_gains, not_measurable
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_VIEWS = 6
@@ -24,11 +24,9 @@ class ViewColor(Effect):
 
     def measure(self, scene: Scene) -> Measurement:
         """See `Effect.measure`; the share of matched points that differ by more than `NOISE`, exposure taken off."""
-        matches = scene.matches
-        fewest = matches.fewest_in_a_view()
-        if fewest < MIN_MATCHES:
-            words = f"not measurable: a photo has {fewest} matched points, fewer than {MIN_MATCHES}"
-            return Measurement(False, words, None, MIN_SHARE)
+        matches, unknown = scene.matches, not_measurable(scene)
+        if unknown:
+            return Measurement(False, unknown, None, MIN_SHARE)
         _, unexplained = fit_gains(matches)
         # A log ratio r of two colours with the mean m is a difference of about r m.
         differences = np.abs(unexplained) * (0.5 * (matches.colors_first + matches.colors_second) + DARK)

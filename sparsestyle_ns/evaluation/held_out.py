@@ -66,7 +66,11 @@ class HeldOutReport:
         }
 
     def save(self, path: Path, experiment: str, method: str, step: int) -> None:
-        """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means."""
+        """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means.
+
+        Raises:
+            OSError: it can't be written.
+        """
         content = {
             "experiment_name": experiment,
             "method_name": method,

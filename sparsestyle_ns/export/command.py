@@ -11,6 +11,7 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.held_out import exact_outputs
 from sparsestyle_ns.evaluation.image_metrics import psnr
 from sparsestyle_ns.export.orbit import make_orbit, most_central, pinholes, resized, survey
@@ -115,10 +116,14 @@ def export_points(scene: StylisedScene, output_path: Path) -> None:
     """Writes the training views' surface points as PLY, and prints how well those of the others show each view.
 
     Raises:
-        InputError: the file can't be written.
+        InputError: there is no surface point, or the file can't be written.
     """
     pictures, parts = _surfaces(scene)
     points = joined(parts)
+    if len(points.positions) == 0:
+        raise InputError(
+            "The views show no surface point, so there is nothing to write; train the coarse field longer."
+        )
     write_output(output_path, encode_ply(points), "The points", "scene.ply")
     print(f"{len(points.positions):,} points, in nerfstudio's coordinates")
     if len(parts) > 1:
@@ -157,7 +162,10 @@ def _surfaces(scene: StylisedScene) -> Tuple[List[Dict[str, Tensor]], List[Point
 
 def _print_likeness(names: List[str], found: List[Likeness]) -> None:
     for name, (covered, value) in zip(names, found, strict=True):
-        print(f"  {name}: {100 * covered:.0f}% of its surfaces covered, PSNR there {value:.1f} dB")
+        if value is None:
+            print(f"  {name}: none of its surfaces is covered, so there is no PSNR")
+        else:
+            print(f"  {name}: {100 * covered:.0f}% of its surfaces covered, PSNR there {value:.1f} dB")
 
 
 def page_picture(voxels: Voxels, model: HierStyleModel, camera: Cameras) -> Float[Tensor, "H W 3"]:

@@ -185,7 +185,7 @@ function start(render) {
   let view = asked in cameras ? asked : orbit.opening;
   let turn = null; // null: a photo's own camera
   let [movingScale, stillScale] = [0.25, 0.25];
-  let [settle, requested] = [0, false];
+  let [settle, requested, coarse] = [0, false, false];
 
   const size = (scale) => {
     if (fixed) return [Number(fixed[1]), Number(fixed[2])];
@@ -204,16 +204,17 @@ function start(render) {
     if (!moving && !fixed && stillScale > 1.2 * scale) show(false); // quicker than thought: draw it finer
   };
 
-  /** Draws soon: coarsely while the camera moves, finely once it rests. */
+  /** Draws soon: coarsely while the camera moves, finely once it rests; of several wishes before a frame, as the last. */
   const show = (moving) => {
     document.body.dataset.state = "moving";
+    coarse = moving;
     clearTimeout(settle);
     if (moving) settle = setTimeout(() => show(false), SETTLE_MILLISECONDS);
     if (requested) return;
     requested = true;
     requestAnimationFrame(() => {
       requested = false;
-      draw(moving);
+      draw(coarse);
     });
   };
 

@@ -92,20 +92,22 @@ class Likeness(NamedTuple):
     """How like a view's exact render a picture of points or of a mesh is.
 
     Attributes:
-        covered: share of the pixels with a surface, in [0, 1], on which the picture shows anything.
-        psnr: on those pixels, in dB.
+        covered: share of the pixels with a surface, in [0, 1], on which the picture shows anything; 0 without any.
+        psnr: on those pixels, in dB; None where there are none.
     """
 
     covered: float
-    psnr: float
+    psnr: Optional[float]
 
 
 def likeness(colors: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"], picture: Dict[str, Tensor]) -> Likeness:
     """Compares a picture that shows something on some pixels with an exact render."""
     solid = picture["accumulation"][..., 0] > MIN_ACCUMULATION
     both = solid & shown
+    if not both.any():
+        return Likeness(0.0, None)
     error = (colors[both] - picture["rgb"][both]).square().mean()
-    return Likeness(float(both.sum() / solid.sum().clamp(min=1)), float(-10.0 * torch.log10(error)))
+    return Likeness(float(both.sum() / solid.sum()), float(-10.0 * torch.log10(error)))
 
 
 def splat(points: Points, camera: Cameras) -> Tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:

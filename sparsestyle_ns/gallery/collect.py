@@ -15,7 +15,7 @@ from sparsestyle_ns.gallery.film import as_pixels, make_film
 from sparsestyle_ns.gallery.page import Picture, RunPictures, View, read_film
 from sparsestyle_ns.page import Pixels
 from sparsestyle_ns.photos import PhotoDataset, at_size
-from sparsestyle_ns.progress import track
+from sparsestyle_ns.progress import say, track
 from sparsestyle_ns.run_folder import REPORT_FILE, STYLE_METHOD, find_config, load_run
 from sparsestyle_ns.style.image import load_style_image
 from sparsestyle_ns.view_selection import evenly_spaced
@@ -35,7 +35,8 @@ def collect_run(
         num_views: held-out views to render, evenly spaced; fewer where there are fewer.
         frames: of the film; 0 for none.
         evaluate: whether to measure the run as `sparsestyle evaluate` does, where its folder has no report of its
-            newest checkpoint; the report is then left there. Without one, the views that are shown are measured.
+            newest checkpoint; the report is then left there, if that can be. Without one, the views that are shown are
+            measured.
 
     Raises:
         InputError: it isn't a finished run of this package, its photos are gone, or the video can't be read.
@@ -54,8 +55,11 @@ def collect_run(
     report = saved_report(config_path.parent, step)
     if report is None and evaluate:
         made = evaluate_held_out(pipeline, pipeline.painting())
-        made.save(config_path.parent / REPORT_FILE, config.experiment_name, config.method_name, step)
         report = SavedReport(made.means, len(made.views))
+        try:
+            made.save(config_path.parent / REPORT_FILE, config.experiment_name, config.method_name, step)
+        except OSError as error:
+            say(f"{REPORT_FILE} can't be left in {config_path.parent} ({error.strerror}); its figures are on the page.")
     painting = config.pipeline.style_image
     return RunPictures(
         name=Path(config.experiment_name).name,

@@ -8,7 +8,7 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import List, Literal, Optional, Sequence
+from typing import Dict, List, Literal, Optional, Sequence
 
 import torch
 
@@ -45,7 +45,9 @@ class PreparedScene:
 
 
 def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> PreparedScene:
-    """Makes a scene of photos: upright, of one size, with poses.
+    """Makes a scene of photos: of one size, with poses.
+
+    Photos without poses are turned upright; poses from a file decide how their photos lie.
 
     What is wrong with the photos is printed, a line each; it stops nothing.
 
@@ -66,6 +68,7 @@ def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> Pr
     if poses is not None:
         paths = poses.photos(paths)
     read = [_read_for_pose(path, poses, index) for index, path in enumerate(paths)]
+    _say_what_is_turned(read, poses)
     framings = frame_photos([photo.image.size for photo in read])
     _say_what_changes(framings)
     findings = check_photos(
@@ -97,24 +100,44 @@ def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> Pr
 
 
 def _read_for_pose(path: Path, poses: Optional[Poses], index: int) -> Photo:
-    """A photo, upright; as it is stored where only that fits its pose, which was then found without turning it.
+    """A photo as its pose is for it: upright where it has none yet.
+
+    COLMAP and the readers of poses_bounds.npy and transforms.json take pixels as they are stored, whatever EXIF says,
+    so a pose from a file is for these; for the upright photo only where its shape leaves no other choice.
 
     Raises:
         InputError: its shape is not that of its pose.
     """
-    photo = read_photo(path)
-    expected = None if poses is None else poses.size(index)
-    if expected is None or fits(photo.image.size, expected):
-        return photo
-    stored = read_photo(path, upright=False)
-    if stored.image.size != photo.image.size and fits(stored.image.size, expected):
-        print(f"{path.name} stays as it is stored: its pose is for the photo before turning it upright")
+    if poses is None:
+        return read_photo(path)
+    stored, expected = read_photo(path, upright=False), poses.size(index)
+    if expected is None or fits(stored.image.size, expected):
         return stored
-    width, height = photo.image.size
+    turned = read_photo(path)
+    if fits(turned.image.size, expected):
+        return turned
+    width, height = stored.image.size
     raise InputError(
         f"{path} is {width} × {height} pixels, which is no scaled version of the {expected[0]} × {expected[1]} that "
         f"its pose in {poses.path} is for; use the photo that the pose was found with."
     )
+
+
+def _say_what_is_turned(photos: Sequence[Photo], poses: Optional[Poses]) -> None:
+    """Prints what was done with photos that aren't stored upright, a line for each way."""
+    told: Dict[str, List[str]] = {}
+    for photo in photos:
+        if photo.orientation != 1:
+            told.setdefault(_how_turned(photo, poses), []).append(photo.path.name)
+    for words, names in told.items():
+        print(f"{', '.join(names)}: {words}")
+
+
+def _how_turned(photo: Photo, poses: Optional[Poses]) -> str:
+    if not photo.upright:
+        return f"not turned, though EXIF says so, since poses in {poses.path} are for photos as they are stored"
+    reason = "" if poses is None else f", since only then the shape is that of the pose in {poses.path}"
+    return f"turned upright, as EXIF says{reason}"
 
 
 def _say_what_changes(framings: Sequence[Framing]) -> None:

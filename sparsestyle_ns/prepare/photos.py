@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import List, Sequence, Tuple
 
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from sparsestyle_ns.errors import InputError
 
@@ -25,10 +25,14 @@ class Photo:
     Attributes:
         path: its file.
         image: its pixels, RGB, or RGBA where any are transparent.
+        orientation: how EXIF says that the stored pixels lie, from 1 (upright) to 8; 1 where it doesn't say.
+        upright: whether `image` was turned by that, where it says anything; else it has the pixels as they are stored.
     """
 
     path: Path
     image: Image.Image
+    orientation: int = 1
+    upright: bool = True
 
 
 @dataclass(frozen=True)
@@ -103,9 +107,12 @@ def read_photo(path: Path, upright: bool = True) -> Photo:
         _register_heic(path)
     try:
         with Image.open(path) as image:
+            image.load()  # by which Pillow turns a TIFF upright, and forgets the orientation
+            orientation = image.getexif().get(ExifTags.Base.Orientation)
             turned = ImageOps.exif_transpose(image) if upright else image
             transparent = turned.has_transparency_data and turned.convert("RGBA").getchannel("A").getextrema()[0] < 255
-            return Photo(path, turned.convert("RGBA" if transparent else "RGB"))
+            pixels = turned.convert("RGBA" if transparent else "RGB")
+            return Photo(path, pixels, orientation if orientation in range(2, 9) else 1, upright)
     except UnidentifiedImageError as error:
         raise InputError(
             f"{path} is no image that can be read; save it again as JPEG or PNG, or take it out."

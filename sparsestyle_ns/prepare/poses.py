@@ -2,13 +2,15 @@
 
 import json
 import math
+import os
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Callable, Dict, List, Optional, Sequence
 
 import numpy as np
 
 from sparsestyle_ns.dataparsers.llff import read_poses_bounds
+from sparsestyle_ns.dataparsers.transforms import check_lenses, read_transforms
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.prepare.photos import MIN_PHOTOS, Framing, Size
 
@@ -17,6 +19,8 @@ ASPECT_TOLERANCE = 0.02
 """Share by which the aspect of a photo may differ from that of its pose: sizes are whole pixels."""
 PIXEL_MAPS = ("mask_path", "depth_file_path")
 """Entries of a frame that are pictures of the photo's old size."""
+SPLITS = ("train_filenames", "val_filenames", "test_filenames")
+"""Entries of a `transforms.json` that list photos by their file_path; nerfstudio wants all three where it has one."""
 
 
 class Poses(ABC):
@@ -60,7 +64,7 @@ def find_poses(photos: Path) -> Optional[Poses]:
 
 def fits(photo: Size, pose: Size) -> bool:
     """Whether a photo is a scaled version of what a pose is for."""
-    return abs(photo[0] * pose[1] / (photo[1] * pose[0]) - 1.0) < ASPECT_TOLERANCE
+    return abs(photo[0] * pose[1] - photo[1] * pose[0]) < ASPECT_TOLERANCE * photo[1] * pose[0]
 
 
 class LLFFPoses(Poses):
@@ -103,47 +107,107 @@ class TransformsPoses(Poses):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            self.content: Dict[str, Any] = json.loads(path.read_text())
-            self.frames = {Path(frame["file_path"]).stem: frame for frame in self.content["frames"]}
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(
-                f"{path} is not nerfstudio's ({type(error).__name__}): it needs a list `frames` with a file_path and a "
-                "transform_matrix each; make it again, or move it away to have COLMAP find the poses."
-            ) from error
-        if "fl_x" not in self.content and "camera_angle_x" not in self.content:
-            lacking = [name for name, frame in self.frames.items() if "fl_x" not in frame]
-            if lacking:
-                raise InputError(f"{path} has no focal length (fl_x) for {lacking[0]}; add it, in pixels.")
+        self.content: Dict[str, Any] = read_transforms(path, with_angle=False)
+        check_lenses(path, self.content)
+        self._check_splits()
+        for frame in self.content["frames"]:
+            if not any(key in part for part in (frame, self.content) for key in ("fl_x", "camera_angle_x")):
+                raise InputError(f"{path} has no focal length (fl_x) for {frame['file_path']}; add it, in pixels.")
         self.used: List[Dict[str, Any]] = []
 
+    def _check_splits(self) -> None:
+        for split in SPLITS:
+            names = self.content.get(split, [])
+            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+                raise InputError(
+                    f"{self.path} has {split} that is no list of names: list the file_path of each photo there, or "
+                    f"take {', '.join(SPLITS)} out."
+                )
+
     def photos(self, found: Sequence[Path]) -> List[Path]:
-        """See `Poses.photos`; photos and frames without the other are left out."""
-        used = [path for path in found if path.stem in self.frames]
-        if len(used) < MIN_PHOTOS:
+        """See `Poses.photos`; photos and frames without the other are left out.
+
+        Raises:
+            InputError: too few photos have a pose, one may have several, or none is to be trained on.
+        """
+        frames = self._frames_of(found)
+        if len(frames) < MIN_PHOTOS:
             raise InputError(
-                f"{self.path} has poses for {len(used)} of the {len(found)} photos, and at least {MIN_PHOTOS} are "
+                f"{self.path} has poses for {len(frames)} of the {len(found)} photos, and at least {MIN_PHOTOS} are "
                 "needed; its file_path entries have to name the photos."
             )
-        self.used = [self.frames[path.stem] for path in used]
-        return used
+        self.used = [frames[path] for path in found if path in frames]
+        if self._splits([frame["file_path"] for frame in self.used]).get(SPLITS[0]) == []:
+            raise InputError(
+                f"None of the photos with poses is in {SPLITS[0]} of {self.path}: list some there, or take "
+                f"{', '.join(SPLITS)} out."
+            )
+        return [path for path in found if path in frames]
+
+    def _frames_of(self, found: Sequence[Path]) -> Dict[Path, Dict[str, Any]]:
+        """The frame of each photo that has one: the one whose file_path leads there or, where none does and no other
+        photo of the name has one so, the one with the same name but for folder and suffix."""
+        frames = self._matched(found, os.path.abspath)
+        settled = {path.stem for path in frames}
+        return {**frames, **self._matched([path for path in found if path.stem not in settled], lambda path: path.stem)}
+
+    def _matched(self, found: Sequence[Path], key: Callable[[Path], str]) -> Dict[Path, Dict[str, Any]]:
+        """Photos with their frames, of which keys agree.
+
+        Raises:
+            InputError: a photo's key is that of several frames, or a frame's of several photos.
+        """
+        frames: Dict[str, List[Dict[str, Any]]] = {}
+        for frame in self.content["frames"]:
+            frames.setdefault(key(self.path.parent / frame["file_path"]), []).append(frame)
+        owners: Dict[str, Path] = {}
+        for path in found:
+            fitting = frames.get(key(path), [])
+            if len(fitting) > 1:
+                first, second = (frame["file_path"] for frame in fitting[:2])
+                raise InputError(
+                    f"Two frames of {self.path}, of {first} and {second}, may both be of {path}: correct file_path or "
+                    "drop one."
+                )
+            if fitting and key(path) in owners:
+                raise InputError(
+                    f"{owners[key(path)]} and {path} may both be the photo of {fitting[0]['file_path']} in "
+                    f"{self.path}: take one away."
+                )
+            if fitting:
+                owners[key(path)] = path
+        return {path: frames[name][0] for name, path in owners.items()}
+
+    def _splits(self, names: Sequence[str]) -> Dict[str, List[str]]:
+        """Which photos to train on and which not, by new names, as far as they are used; nothing if the file has none.
+
+        Args:
+            names: of the frames in use.
+        """
+        if not any(split in self.content for split in SPLITS):
+            return {}
+        renamed = {Path(frame["file_path"]): name for frame, name in zip(self.used, names, strict=True)}
+        listed = {split: map(Path, self.content.get(split, [])) for split in SPLITS}
+        return {split: [renamed[path] for path in paths if path in renamed] for split, paths in listed.items()}
 
     def size(self, index: int) -> Optional[Size]:
         """See `Poses.size`."""
         width, height = (self._value(index, key) for key in ("w", "h"))
         return None if width is None or height is None else (round(width), round(height))
 
-    def _value(self, index: int, key: str) -> Optional[float]:
-        return self.used[index].get(key, self.content.get(key))
+    def _value(self, index: int, key: str, default: Optional[float] = None) -> Optional[float]:
+        return self.used[index].get(key, self.content.get(key, default))
 
     def write(self, folder: Path, names: Sequence[str], framings: Sequence[Framing]) -> None:
         """See `Poses.write`. Distortion is in units of the focal length, and stays as it is."""
+        names = [f"images/{name}" for name in names]
         frames = []
         for index, (frame, name, framing) in enumerate(zip(self.used, names, framings, strict=True)):
             frame = {key: value for key, value in frame.items() if key not in PIXEL_MAPS}
-            frames.append({**frame, "file_path": f"images/{name}", **self._intrinsics(index, framing)})
+            frames.append({**frame, "file_path": name, **self._intrinsics(index, framing)})
         shared = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "ply_file_path")
         content = {key: value for key, value in self.content.items() if key not in shared}
+        content.update(self._splits(names))
         (folder / TRANSFORMS).write_text(json.dumps({**content, "frames": frames}, indent=2) + "\n")
 
     def _intrinsics(self, index: int, framing: Framing) -> Dict[str, float]:
@@ -152,10 +216,8 @@ class TransformsPoses(Poses):
         focal_x = self._value(index, "fl_x")
         if focal_x is None:
             focal_x = 0.5 * width / math.tan(0.5 * self._value(index, "camera_angle_x"))
-        focal_y = self._value(index, "fl_y") or focal_x
-        center_x, center_y = self._value(index, "cx"), self._value(index, "cy")
-        center_x = 0.5 * width if center_x is None else center_x
-        center_y = 0.5 * height if center_y is None else center_y
+        focal_y = self._value(index, "fl_y", focal_x)
+        center_x, center_y = self._value(index, "cx", 0.5 * width), self._value(index, "cy", 0.5 * height)
         return {
             "fl_x": across * focal_x,
             "fl_y": down * focal_y,

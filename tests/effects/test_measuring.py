@@ -1,17 +1,29 @@
 """What effects measure, against cases worked out by hand."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
-from sparsestyle_ns.effects.exposure import fit_gains
+from sparsestyle_ns.effects.exposure import Exposure, fit_gains
 from sparsestyle_ns.effects.layouts import meeting_point, viewing_spread
-from sparsestyle_ns.effects.lens_distortion import largest_shift
-from sparsestyle_ns.effects.matched_depth import matched_rays
-from sparsestyle_ns.effects.matches import PointMatches, distances_along, epipolar_error, mutual_matches, sample
+from sparsestyle_ns.effects.lens_distortion import LensDistortion, largest_shift
+from sparsestyle_ns.effects.matched_depth import MatchedDepth, matched_rays
+from sparsestyle_ns.effects.matches import (
+    LENSES,
+    PointMatches,
+    distances_along,
+    epipolar_error,
+    mutual_matches,
+    rays_of,
+    sample,
+    undistorted,
+)
 from sparsestyle_ns.effects.scene import Scene, border, read_rgba
+from sparsestyle_ns.effects.view_color import ViewColor
 from sparsestyle_ns.errors import InputError
 
 
@@ -47,10 +59,77 @@ def test_a_true_match_obeys_the_cameras_and_a_shifted_one_is_off_by_the_shift():
         return local / -local[:, 2:]
 
     first, second = seen(poses[0]), seen(poses[1])
-    assert epipolar_error(first, second, *poses) == pytest.approx(np.zeros(20), abs=1e-9)
+
+    def error(first, second):
+        rays = (rays_of(points[:, :2] * [1, -1], CameraType.PERSPECTIVE) for points in (first, second))
+        return epipolar_error(*rays, *poses)
+
+    assert error(first, second) == pytest.approx(np.zeros(20), abs=1e-9)
     # Beside each other, cameras allow any shift sideways and none upwards; Sampson shares it between both photos.
-    assert epipolar_error(first, second + np.array([0.1, 0, 0]), *poses) == pytest.approx(np.zeros(20), abs=1e-9)
-    assert epipolar_error(first, second + np.array([0, 0.1, 0]), *poses) == pytest.approx(np.full(20, 0.1 / np.sqrt(2)))
+    assert error(first, second + np.array([0.1, 0, 0])) == pytest.approx(np.zeros(20), abs=1e-9)
+    assert error(first, second + np.array([0, 0.1, 0])) == pytest.approx(np.full(20, 0.1 / np.sqrt(2)))
+
+
+IMAGE_POINTS = np.random.default_rng(2).uniform(-0.9, 0.9, (30, 2))
+"""Over the focal length."""
+
+
+@pytest.mark.parametrize("kind", LENSES)
+def test_points_are_seen_where_nerfstudios_rays_go(kind):
+    """Of a fisheye, too, and with all six parameters of its distortion."""
+    lens = torch.tensor([[0.05, -0.02, 0.01, 0.004, 0.003, -0.002]])
+    pose = torch.eye(4)[None, :3]
+    cameras = Cameras(pose, 100.0, 90.0, 110.0, 95.0, 220, 190, distortion_params=lens, camera_type=kind)
+    pixels = torch.from_numpy(IMAGE_POINTS * [100.0, 90.0] + [110.0, 95.0]).float()
+    expected = cameras.generate_rays(camera_indices=0, coords=pixels.flip(-1)).directions.numpy()
+    found = rays_of(undistorted(IMAGE_POINTS, cameras, 0), kind).directions
+    np.testing.assert_allclose(found / np.linalg.norm(found, axis=-1, keepdims=True), expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("kind", LENSES)
+def test_tangents_are_the_derivatives_of_directions(kind):
+    points = np.concatenate([IMAGE_POINTS, [[0.0, 0.0], [1e-5, -1e-5]]])
+    for axis, step in enumerate(1e-6 * np.eye(2)):
+        ahead, behind = (rays_of(points + sign * step, kind).directions for sign in (1, -1))
+        np.testing.assert_allclose(rays_of(points, kind).tangents[..., axis], (ahead - behind) / 2e-6, atol=1e-8)
+
+
+def test_a_match_of_fisheyes_is_off_by_its_shift_in_the_image_up_to_the_side():
+    """Cameras beside each other; points up to 80 degrees aside, where a perspective image is stretched sixfold."""
+    poses = camera_at((-1, 0, 0), (0, 0, 1)), camera_at((1, 0, 0), (0, 0, 1))
+    generator = np.random.default_rng(0)
+    angle, turn = generator.uniform(0.2, 1.4, 50), generator.uniform(0, 2 * np.pi, 50)
+    directions = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), -np.cos(angle)], axis=-1)
+    points = 1e5 * directions
+
+    def seen(pose):
+        local = (points - pose[:, 3]) @ pose[:, :3]
+        aside = np.linalg.norm(local[:, :2], axis=-1, keepdims=True)
+        return np.arctan2(aside, -local[:, 2:]) * local[:, :2] / aside * [1, -1]
+
+    def error(first, second):
+        rays = (rays_of(points, CameraType.FISHEYE) for points in (first, second))
+        return epipolar_error(*rays, *poses)
+
+    first, second = seen(poses[0]), seen(poses[1])
+    assert error(first, second) == pytest.approx(np.zeros(50), abs=1e-9)
+    # Far points are seen alike by both; the shift along the gradient is shared between both photos.
+    shift = 1e-4
+    slopes = [(error(first, second + step) - error(first, second)) / shift for step in shift * np.eye(2)]
+    assert np.hypot(*slopes) == pytest.approx(np.full(50, 1 / np.sqrt(2)), rel=0.01)
+
+
+def test_of_other_cameras_effects_say_that_nothing_is_measured():
+    kinds = torch.tensor([[CameraType.PERSPECTIVE.value], [CameraType.EQUIRECTANGULAR.value]])
+    poses = torch.eye(4)[None, :3].repeat(2, 1, 1)
+    cameras = Cameras(poses, 50.0, 50.0, 50.0, 25.0, 100, 50, camera_type=kinds)
+    scene = Scene([Path("a.png"), Path("b.png")], cameras, torch.tensor([[-1.0] * 3, [1.0] * 3]), {})
+    scene.photos = [np.random.default_rng(index).uniform(size=(50, 100, 4)).astype(np.float32) for index in range(2)]
+    for effect in (Exposure(), ViewColor(), MatchedDepth()):
+        found = effect.measure(scene)
+        assert (found.on, found.value) == (False, None)
+        assert found.reason.startswith("not measurable: points are matched between perspective and fisheye cameras")
+        assert "equirectangular" in found.reason
 
 
 def test_only_the_nearest_neighbours_of_each_other_match_and_only_where_they_stand_out():
@@ -148,6 +227,13 @@ def test_the_shift_by_a_lens_is_that_of_the_corner():
         flat = flat[np.isreal(flat)].real[0]
         assert largest_shift(lens(k1)) == pytest.approx(100 * (seen - flat), rel=1e-5)
     assert largest_shift(lens(0.0)) == 0
+
+
+def test_parameters_without_which_a_camera_has_no_rays_are_kept():
+    cameras = lens(0.0)
+    cameras.camera_type[:] = CameraType.FISHEYE624.value
+    found = LensDistortion().measure(Scene([Path("a.png")], cameras, torch.tensor([[-1.0] * 3, [1.0] * 3]), {}))
+    assert (found.on, found.value) == (True, None)
 
 
 def test_the_border_of_a_photo_is_its_rim():

@@ -139,6 +139,25 @@ def test_the_wheel_comes_nearer_keys_turn_and_the_button_goes_back_to_the_photos
 
 
 @needs_chromium
+def test_a_fine_picture_that_is_asked_for_while_a_coarse_one_is_due_is_drawn(tab, tmp_path):
+    path = tmp_path / "page.html"
+    path.write_bytes(page_of("box"))
+    tab.open(f"{path.as_uri()}#size={WIDTH}x{HEIGHT}")
+    tab.wait_for(READY)
+    opening = shown(tab)
+    # Both before the next frame, which a callback that is asked for after them comes at the end of.
+    state = tab.evaluate(
+        """new Promise((done) => {
+            canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowLeft" }));
+            document.getElementById("next").click();
+            requestAnimationFrame(() => done(document.body.dataset.state));
+        })"""
+    )
+    assert state == "ready"
+    torch.testing.assert_close(shown(tab), opening)
+
+
+@needs_chromium
 def test_without_webgl_the_page_says_what_to_do(tab, tmp_path):
     path = tmp_path / "page.html"
     path.write_bytes(page_of("box"))

@@ -12,6 +12,7 @@ from plyfile import PlyData
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.export import command
 from sparsestyle_ns.export.mesh import picture_of_mesh, poisson_mesh
 from sparsestyle_ns.export.points import (
     Points,
@@ -115,6 +116,37 @@ def test_likeness_counts_surfaces_only():
     found = likeness(torch.full((1, 4, 3), 0.6), shown, picture)
     assert found.covered == pytest.approx(2 / 3)
     assert found.psnr == pytest.approx(20.0, abs=1e-3)
+
+
+def test_where_no_surface_is_covered_there_is_no_psnr(ball, capsys):
+    pictures, parts = ball
+    nowhere = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    assert likeness(torch.zeros(HEIGHT, WIDTH, 3), nowhere, pictures[0]) == (0.0, None)
+    nothing = {**pictures[0], "accumulation": torch.zeros(HEIGHT, WIDTH, 1)}
+    assert likeness(torch.zeros(HEIGHT, WIDTH, 3), ~nowhere, nothing) == (0.0, None)
+    unseen = Points(*torch.empty(3, 0, 3))
+    found = cross_likeness([parts[0], unseen, unseen], cameras(), pictures)
+    assert [value is None for _, value in found] == [True, False, False]
+
+
+def test_an_export_says_in_words_that_a_view_is_not_covered(ball, tmp_path, capsys, monkeypatch):
+    pictures, parts = ball
+    unseen = Points(*torch.empty(3, 0, 3))
+    monkeypatch.setattr(command, "_surfaces", lambda scene: (pictures, [parts[0], unseen, unseen]))
+    scene = SimpleNamespace(cameras=cameras(), names=["a.png", "b.png", "c.png"])
+    command.export_points(scene, tmp_path / "points.ply")
+    printed = capsys.readouterr().out
+    assert "a.png: none of its surfaces is covered, so there is no PSNR\n" in printed
+    assert len(re.findall(r"% of its surfaces covered, PSNR there [\d.]+ dB", printed)) == 2
+    assert "nan" not in printed
+
+
+def test_no_points_make_no_file(ball, tmp_path, monkeypatch):
+    unseen = Points(*torch.empty(3, 0, 3))
+    monkeypatch.setattr(command, "_surfaces", lambda scene: (ball[0], [unseen] * 3))
+    with pytest.raises(InputError, match="The views show no surface point, so there is nothing to write"):
+        command.export_points(SimpleNamespace(cameras=cameras(), names=["a", "b", "c"]), tmp_path / "points.ply")
+    assert not (tmp_path / "points.ply").exists()
 
 
 def test_other_programs_read_the_points(tmp_path, ball):

@@ -137,6 +137,15 @@ def test_a_run_without_a_report_is_measured_when_that_is_asked_for_and_keeps_it(
     assert newest_checkpoint(moved / "nerfstudio_models").name == "step-000000002.ckpt"
 
 
+def test_a_run_whose_folder_takes_no_report_is_measured_and_shown_all_the_same(runs, tmp_path, capsys):
+    moved = tmp_path / "outputs" / "scene" / "hier-style" / "run"
+    shutil.copytree(runs.style, moved)
+    (moved / "evaluation.json").mkdir()
+    shown = collect_run(moved, num_views=1, frames=0, evaluate=True)
+    assert [table.title.split(",")[0] for table in shown.tables][:2] == ["Coarse field", "Style and content"]
+    assert f"evaluation.json can't be left in {moved} (Is a directory); its figures are" in capsys.readouterr().out
+
+
 def frames_of(content):
     """The frames of a film."""
     return np.stack(list(iio.imiter(io.BytesIO(content), plugin="FFMPEG", extension=".mp4")))

@@ -20,7 +20,9 @@ from test_commands import write_ring, write_transforms
 from sparsestyle_ns.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig, read_poses_bounds
 from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.photos import open_photo
+from sparsestyle_ns.photos import open_photo, photo_size
+from sparsestyle_ns.prepare.photos import frame_photos
+from sparsestyle_ns.prepare.poses import TransformsPoses, fits
 from sparsestyle_ns.style.image import load_style_image
 from sparsestyle_ns.view_selection import select_views
 
@@ -152,6 +154,8 @@ PLACES = st.sampled_from(
         ("h",),
         ("camera_model",),
         ("k1",),
+        ("distortion_params",),
+        ("train_filenames",),
         ("frames", 1),
         ("frames", 0, "file_path"),
         ("frames", 2, "transform_matrix"),
@@ -213,6 +217,34 @@ def test_damaged_transforms_are_read_or_refused(ring, tmp_path, cuts, blender):
     (folder / name).write_bytes(damaged((ring / name).read_bytes(), cuts))
     parser = BlenderDataParserConfig() if blender else NerfstudioDataParserConfig(downscale_factor=1)
     read_or_refuse(load_scene, folder, parser)
+
+
+@hard_case(
+    "files",
+    case="transforms.json beside photos that are to be prepared, with anything in place of what belongs there",
+    could_go_wrong="a TypeError, KeyError or ZeroDivisionError, or intrinsics that are no numbers in the new file",
+    must_hold="refused in one sentence, or every new frame has finite intrinsics and its photo's name",
+)
+@FUZZ
+@given(place=PLACES, value=VALUES)
+def test_transforms_with_strange_values_are_prepared_or_refused(ring, tmp_path, place, value):
+    content = replaced(json.loads((ring / "transforms.json").read_text()), place, value)
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    try:
+        poses = TransformsPoses(tmp_path / "transforms.json")
+        photos = poses.photos(sorted((ring / "images").iterdir()))
+        size = photo_size(photos[0])
+        if not all(poses.size(index) is None or fits(size, poses.size(index)) for index in range(len(photos))):
+            return
+        names = [path.name for path in photos]
+        (tmp_path / "scene").mkdir(exist_ok=True)
+        poses.write(tmp_path / "scene", names, frame_photos([size] * len(photos)))
+    except InputError as error:
+        assert "\n" not in str(error)
+        return
+    frames = json.loads((tmp_path / "scene" / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == [f"images/{name}" for name in names]
+    assert np.isfinite([[frame[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")] for frame in frames]).all()
 
 
 def test_deeply_nested_json_is_refused(ring, tmp_path):

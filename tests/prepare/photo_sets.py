@@ -7,7 +7,7 @@ from typing import List, Sequence, Tuple
 
 import make_sample_scene
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
 WIDTH, HEIGHT = 320, 240
 FOCAL = 0.85 * WIDTH
@@ -36,6 +36,13 @@ def write_photos(folder: Path, places: Sequence[Place] = tuple(ASIDE), suffix: s
     for name, place in zip(names, places, strict=True):
         photo(place).save(folder / name)
     return names
+
+
+def save_with_orientation(image: Image.Image, path: Path, orientation: int) -> None:
+    """A picture with what EXIF says of how its stored pixels lie."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    image.save(path, exif=exif)
 
 
 def write_poses_bounds(folder: Path, places: Sequence[Place] = tuple(ASIDE)) -> None:

@@ -4,7 +4,8 @@ import sys
 
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
+from photo_sets import save_with_orientation
+from PIL import Image
 
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.prepare.photos import Framing, find_photos, frame_photos, read_photo, write_photos
@@ -16,19 +17,29 @@ def gradient(width, height):
     return Image.fromarray(np.stack([columns, rows, 0 * rows], axis=-1).astype(np.uint8))
 
 
-def save_with_orientation(image, path, orientation):
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = orientation
-    image.save(path, exif=exif)
-
-
 def test_exif_rotation_is_applied(tmp_path):
     # Orientation 6: the stored picture has to be turned clockwise by 90 degrees.
     save_with_orientation(gradient(40, 20), tmp_path / "a.png", 6)
     turned = np.asarray(read_photo(tmp_path / "a.png").image)
     assert turned.shape == (40, 20, 3)
     np.testing.assert_array_equal(turned, np.rot90(np.asarray(gradient(40, 20)), -1))
-    assert read_photo(tmp_path / "a.png", upright=False).image.size == (40, 20)
+    stored = read_photo(tmp_path / "a.png", upright=False)
+    assert (stored.image.size, stored.orientation, stored.upright) == ((40, 20), 6, False)
+
+
+@pytest.mark.parametrize("orientation", [0, 1, 9, 6000])
+def test_orientations_that_ask_for_nothing_count_as_upright(tmp_path, orientation):
+    save_with_orientation(gradient(40, 20), tmp_path / "a.png", orientation)
+    photo = read_photo(tmp_path / "a.png")
+    assert (photo.image.size, photo.orientation) == ((40, 20), 1)
+
+
+def test_a_tiff_is_upright_when_it_is_read_as_nerfstudio_reads_it(tmp_path):
+    """Pillow turns TIFFs by itself, so there is nothing left to be said of them."""
+    save_with_orientation(gradient(40, 20), tmp_path / "a.tiff", 6)
+    photo = read_photo(tmp_path / "a.tiff", upright=False)
+    assert (photo.image.size, photo.orientation) == ((20, 40), 1)
+    np.testing.assert_array_equal(np.asarray(photo.image), np.asarray(Image.open(tmp_path / "a.tiff")))
 
 
 def test_only_real_transparency_is_kept(tmp_path):

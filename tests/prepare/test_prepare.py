@@ -9,10 +9,22 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from photo_sets import ASIDE, FOCAL, HEIGHT, TURNED, WIDTH, photo, write_photos, write_poses_bounds, write_transforms
+from photo_sets import (
+    ASIDE,
+    FOCAL,
+    HEIGHT,
+    TURNED,
+    WIDTH,
+    photo,
+    save_with_orientation,
+    write_photos,
+    write_poses_bounds,
+    write_transforms,
+)
 from PIL import ExifTags, Image
 
 from sparsestyle_ns.cli import main
+from sparsestyle_ns.datamanager import read_scene
 from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.prepare.command import prepare_scene
@@ -25,6 +37,13 @@ def parse_llff(folder):
 def parse_nerfstudio(folder):
     settings = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
     return NerfstudioDataParserConfig(data=folder, **settings).setup().get_dataparser_outputs("train")
+
+
+def change_transforms(folder, change):
+    """Rewrites a transforms.json."""
+    content = json.loads((folder / "transforms.json").read_text())
+    change(content)
+    (folder / "transforms.json").write_text(json.dumps(content))
 
 
 def install_fake(folder, name, script):
@@ -139,15 +158,53 @@ def test_poses_bounds_follow_the_photos_size(tmp_path):
     assert (int(cameras.width[0]), cameras.fx[0].item()) == (160, pytest.approx(FOCAL / 2))
 
 
-def test_a_photo_stays_as_stored_where_only_that_fits_its_pose(tmp_path, capsys):
+@pytest.mark.parametrize("orientation", [2, 3, 4, 6])
+@pytest.mark.parametrize("write_poses", ["poses_bounds", "transforms"])
+def test_a_photo_with_a_pose_stays_as_it_is_stored(tmp_path, capsys, orientation, write_poses):
+    """nerfstudio's readers and COLMAP leave EXIF alone, so this is what the pose was found with."""
+    photos = tmp_path / "photos"
+    names = write_photos(photos)
+    save_with_orientation(photo(ASIDE[0]), photos / names[0], orientation)
+    write_poses_bounds(photos) if write_poses == "poses_bounds" else write_transforms(photos, names)
+    scene = prepare_scene(photos, tmp_path / "scene")
+    said = f"a.png: not turned, though EXIF says so, since poses in {photos / write_poses}"
+    assert [line.startswith(said) for line in capsys.readouterr().out.splitlines()].count(True) == 1
+    prepared = Image.open(tmp_path / "scene" / "images" / scene.names[0])
+    np.testing.assert_array_equal(np.asarray(prepared), np.asarray(photo(ASIDE[0])))
+    assert ExifTags.Base.Orientation not in prepared.getexif()
+
+
+def test_a_square_photo_with_a_pose_stays_as_it_is_stored(tmp_path):
+    names = write_photos(tmp_path / "photos")
+    write_transforms(tmp_path / "photos", names, w=HEIGHT, h=HEIGHT, cx=120.0, cy=120.0)
+    square = [photo(place).crop((40, 0, 280, 240)) for place in ASIDE]
+    for name, image in zip(names, square, strict=True):
+        save_with_orientation(image, tmp_path / "photos" / name, 6)
+    prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    prepared = Image.open(tmp_path / "scene" / "images" / "photo_000.png")
+    np.testing.assert_array_equal(np.asarray(prepared), np.asarray(square[0]))
+
+
+def test_where_transforms_give_no_size_photos_stay_as_they_are_stored(tmp_path):
+    names = write_photos(tmp_path / "photos")
+    write_transforms(tmp_path / "photos", names)
+    change_transforms(tmp_path / "photos", lambda content: [content.pop(key) for key in ("w", "h")])
+    for name, place in zip(names, ASIDE, strict=True):
+        save_with_orientation(photo(place), tmp_path / "photos" / name, 6)
+    prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    prepared = Image.open(tmp_path / "scene" / "images" / "photo_000.png")
+    np.testing.assert_array_equal(np.asarray(prepared), np.asarray(photo(ASIDE[0])))
+
+
+def test_a_photo_is_turned_upright_where_only_so_it_has_the_shape_of_its_pose(tmp_path, capsys):
     names = write_photos(tmp_path / "photos")
     write_poses_bounds(tmp_path / "photos")
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6
-    photo(ASIDE[0]).save(tmp_path / "photos" / names[0], exif=exif)
+    # Orientation 6: the stored picture has to be turned clockwise by 90 degrees.
+    save_with_orientation(photo(ASIDE[0]).rotate(90, expand=True), tmp_path / "photos" / names[0], 6)
     prepare_scene(tmp_path / "photos", tmp_path / "scene")
-    assert "a.png stays as it is stored" in capsys.readouterr().out
-    assert Image.open(tmp_path / "scene" / "images" / "photo_000.png").size == (WIDTH, HEIGHT)
+    assert "a.png: turned upright, as EXIF says, since only then the shape is" in capsys.readouterr().out
+    prepared = Image.open(tmp_path / "scene" / "images" / "photo_000.png")
+    np.testing.assert_array_equal(np.asarray(prepared), np.asarray(photo(ASIDE[0])))
 
 
 def test_without_poses_and_colmap_one_sentence_names_the_ways_out(tmp_path, no_colmap, capsys):
@@ -169,11 +226,12 @@ def test_what_is_wrong_with_the_photos_is_said_before_colmap_is_missed(tmp_path,
 
 def test_colmap_gets_upright_photos_of_one_size(tmp_path, colmap, capsys):
     write_photos(tmp_path / "photos", suffix=".jpg")
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6
-    photo(ASIDE[0]).rotate(90, expand=True).resize((480, 640)).save(tmp_path / "photos" / "a.jpg", exif=exif)
+    turned = photo(ASIDE[0]).rotate(90, expand=True).resize((480, 640))
+    save_with_orientation(turned, tmp_path / "photos" / "a.jpg", 6)
     main(["prepare", str(tmp_path / "photos"), "--output", str(tmp_path / "scene")])
-    assert capsys.readouterr().out.splitlines()[-1].endswith("nerfstudio-data")
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == "a.jpg: turned upright, as EXIF says"
+    assert printed[-1].endswith("nerfstudio-data")
     arguments = json.loads(colmap.read_text())
     assert arguments[0] == "images"
     assert arguments[arguments.index("--matching-method") + 1] == "exhaustive"
@@ -223,18 +281,96 @@ def test_photos_and_poses_that_do_not_fit_are_refused(tmp_path, spoil, sentence)
     assert not (tmp_path / "scene").exists()
 
 
-def test_transforms_of_other_photos_or_without_focal_length_are_refused(tmp_path):
+def test_transforms_of_other_photos_are_refused(tmp_path):
     photos = tmp_path / "photos"
     write_photos(photos)
     write_transforms(photos, ["x.png", "y.png", "z.png"])
     with pytest.raises(InputError, match="has poses for 0 of the 3 photos"):
         prepare_scene(photos, tmp_path / "scene")
-    (photos / "transforms.json").write_text('{"frames": [{"file_path": "a.png"}]}')
-    with pytest.raises(InputError, match="no focal length"):
+
+
+def lists(key, value):
+    return lambda content: content.update({key: value})
+
+
+def frame_lists(key, value):
+    return lambda content: content["frames"][1].update({key: value})
+
+
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (lambda content: content.clear(), "has no list of frames"),
+        (lambda content: content["frames"][1].pop("transform_matrix"), r"Frame 1 .*b.png, has a transform_matrix that"),
+        (frame_lists("transform_matrix", [[1, 2], [3]]), r"Frame 1 .*b.png, has a transform_matrix that"),
+        (frame_lists("transform_matrix", [[0] * 4] * 4), r"Frame 1 .*b.png, has a transform_matrix that"),
+        (frame_lists("file_path", None), "Frame 1 .*names no photo"),
+        (lambda content: content.pop("fl_x"), "no focal length .*a.png"),
+        (lists("fl_x", None), r"transforms.json has fl_x null: give a number of pixels above 0"),
+        (lists("fl_x", "500"), r'has fl_x "500": give a number of pixels above 0'),
+        (lists("fl_y", 0), r"has fl_y 0: give a number of pixels above 0"),
+        (lists("w", "640px"), r'has w "640px": give a number of pixels above 0'),
+        (lists("h", True), r"has h true: give a number of pixels above 0"),
+        (lists("h", 1e-9), r"a.png is 320 × 240 pixels, which is no scaled version"),
+        (lists("cx", [160]), r"has cx \[160\]: give a number, or take it out"),
+        (lists("k1", None), r"has k1 null: give a number, or take it out"),
+        (lists("distortion_params", [0.1]), r"has distortion_params \[0.1\]: give six numbers"),
+        (lists("camera_angle_x", 4), r"has camera_angle_x 4: give the horizontal angle"),
+        (frame_lists("fl_x", None), r"frame 1 \(from 0\) of .*has fl_x null: give a number"),
+        (
+            frame_lists("file_path", "r/a.jpg"),
+            "Two frames .*images/a.png and r/a.jpg, may both be of",
+        ),
+        (lists("val_filenames", "images/a.png"), r"val_filenames that is no list of names"),
+        (lists("train_filenames", None), r"train_filenames that is no list of names"),
+        (lists("train_filenames", ["images/gone.png"]), r"None of the photos with poses is in train_filenames"),
+    ],
+)
+def test_what_is_wrong_with_transforms_is_said_in_one_sentence(tmp_path, spoil, sentence):
+    photos = tmp_path / "photos"
+    write_transforms(photos, write_photos(photos))
+    change_transforms(photos, spoil)
+    with pytest.raises(InputError, match=sentence) as refused:
         prepare_scene(photos, tmp_path / "scene")
-    (photos / "transforms.json").write_text("[]")
-    with pytest.raises(InputError, match="is not nerfstudio's"):
-        prepare_scene(photos, tmp_path / "scene")
+    assert "\n" not in str(refused.value)
+    assert not (tmp_path / "scene").exists()
+
+
+def test_two_photos_for_one_pose_are_refused(tmp_path):
+    write_transforms(tmp_path / "photos", write_photos(tmp_path / "photos"))
+    photo(ASIDE[0]).save(tmp_path / "photos" / "a.jpg")
+    with pytest.raises(InputError, match=r"a.jpg and .*a.png may both be the photo of images/a.png"):
+        prepare_scene(tmp_path / "photos", tmp_path / "scene")
+
+
+def test_a_frame_whose_path_leads_to_a_photo_is_that_photos_own(tmp_path):
+    """Others of the same name, in another folder or of another kind, are left out."""
+    scene = tmp_path / "photos"
+    names = write_photos(scene / "images")
+    write_transforms(scene, names)
+    write_photos(scene / "images", suffix=".jpg")
+    stray = {"file_path": "left/a.png", "transform_matrix": np.eye(4).tolist()}
+    change_transforms(scene, lambda content: content["frames"].insert(0, stray))
+    prepare_scene(scene, tmp_path / "scene")
+    poses = parse_nerfstudio(tmp_path / "scene").cameras.camera_to_worlds
+    np.testing.assert_allclose(poses[0, :, 3].tolist(), ASIDE[0][0], atol=1e-6)
+    assert len(list((tmp_path / "scene" / "images").iterdir())) == 3
+
+
+@pytest.mark.parametrize("held_out", [["./images/d.png", "images/gone.png"], ["images/gone.png"]])
+def test_the_photos_that_a_file_trains_on_are_those_of_the_scene(tmp_path, held_out):
+    """Under their new names; nerfstudio reads a file only if each of its lists names photos that are there."""
+    photos = tmp_path / "photos"
+    places = [*ASIDE, TURNED[0]]
+    names = write_photos(photos, places)
+    write_transforms(photos, names, places, train_filenames=["images/c.png", "images/a.png"], val_filenames=held_out)
+    prepare_scene(photos, tmp_path / "scene")
+    parser = NerfstudioDataParserConfig(data=tmp_path / "scene", downscale_factor=1).setup()
+    found = {
+        split: [path.name for path in read_scene(parser, split).image_filenames] for split in ("train", "val", "test")
+    }
+    kept = ["photo_003.png"] if "./images/d.png" in held_out else []
+    assert found == {"train": ["photo_000.png", "photo_002.png"], "val": kept, "test": []}
 
 
 def test_a_folder_with_something_in_it_is_left_alone(tmp_path):
