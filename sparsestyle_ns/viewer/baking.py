@@ -70,13 +70,15 @@ class Baker(threading.Thread):
         self.cameras = likely_cameras(cameras)
         self.filled: WeakKeyDictionary[BakedVolume, Set[int]] = WeakKeyDictionary()
         """The cameras whose rays have all been followed in a volume, for as long as the model keeps that."""
+        self.ending = threading.Event()
+        """Ends it."""
 
     def run(self) -> None:
-        """Works until the process ends."""
-        while True:
+        """Works until it is to end."""
+        while not self.ending.is_set():
             task = self._next() if self.is_free() else None
             if task is None:
-                time.sleep(0.1)
+                self.ending.wait(0.1)
             else:
                 self._fill(*task)
 
@@ -107,10 +109,10 @@ class Baker(threading.Thread):
     @torch.no_grad()
     def _follow(self, style: nn.Module, origins: Tensor, directions: Tensor) -> Optional[BakedVolume]:
         """Fills what these rays meet, once there is time, and returns in which volume; None where the style isn't
-        shown any more."""
-        while not self.is_free():
-            time.sleep(0.1)
-        if style not in self.shown():
+        shown any more, or it is to end."""
+        while not self.is_free() and not self.ending.wait(0.1):
+            pass
+        if self.ending.is_set() or style not in self.shown():
             return None
         with self.lock:
             self.model.fill_baked(origins, directions, style)

@@ -1,5 +1,6 @@
 """The "Style" panel of `hier-style` in nerfstudio's viewer, in ns-train and ns-viewer alike."""
 
+import atexit
 import math
 import threading
 import time
@@ -50,6 +51,8 @@ SECONDS_AT_REST = 0.3
 """A restyling goes on when nothing was moved for so long: a picture on the way needs the processor."""
 SECONDS_UNTIL_BAKING = 2.0
 """Volumes are filled ahead when nothing was moved for so long, so that the still picture comes first."""
+SECONDS_TO_END = 60.0
+"""What is at work when the viewer ends gets so long to come to an end."""
 MAX_SIDE_ON_CPU = 256
 """Longer side of still pictures where there is no GPU; nerfstudio's own is 512."""
 
@@ -98,7 +101,9 @@ class StylePanel(ViewerControl):
         self.bar, self.message = ProgressBar(), Markdown()
         self.styles: List[Style] = []
         self.viewer: Any = None
+        self.baker: Optional[Baker] = None
         self._workshop: Optional[Workshop] = None
+        self._restyler: Optional[threading.Thread] = None
         self._stop, self._busy = threading.Event(), threading.Lock()
         self._last_change = 0.0
         self._losses_told, self._progress_told = Pace(), Pace()
@@ -120,7 +125,21 @@ class StylePanel(ViewerControl):
             cameras = self.pipeline.datamanager.train_dataset.cameras
             self.baker = Baker(self.pipeline.model, cameras, self._shown, self._is_free, self._lock())
             self.baker.start()
+        atexit.register(self.close)
         viewer.viser_server.on_client_connect(self._welcome)
+
+    def close(self) -> None:
+        """Ends what is at work in the background and waits for that; a style that is being saved is saved.
+
+        Python calls it at its end: a thread that is in the middle of torch then would abort the process.
+        """
+        atexit.unregister(self.close)
+        self._stop.set()
+        if self.baker is not None:
+            self.baker.ending.set()
+        for thread in (self.baker, self._restyler):
+            if thread is not None:
+                thread.join(SECONDS_TO_END)
 
     def _take_defaults(self) -> None:
         if self.pipeline.device.type == "cpu":
@@ -310,7 +329,8 @@ class StylePanel(ViewerControl):
             return
         self._stop.clear()
         self.stop.set_visible(True)
-        threading.Thread(target=self._work, args=(restyling,), name="restyling", daemon=True).start()
+        self._restyler = threading.Thread(target=self._work, args=(restyling,), name="restyling", daemon=True)
+        self._restyler.start()
 
     def _new_restyling(self, image: StyleImage) -> Restyling:
         if self._workshop is None:

@@ -173,8 +173,7 @@ class Restyling:
     def save(self) -> Path:
         """Saves the style as a run of its own beside the one in the viewer, for ns-render, ns-viewer and the rest.
 
-        The run is there as a whole or not at all: it is made in a hidden folder, which goes when something fails or
-        when the process ends meanwhile.
+        The run is there as a whole or not at all: it is made in a hidden folder, which goes when something fails.
 
         Returns:
             The new run's folder.
@@ -183,8 +182,9 @@ class Restyling:
             OSError, RuntimeError: it can't be written; torch's writer makes the second of some of the first.
         """
         runs = self.workshop.folder.parent
-        with tempfile.TemporaryDirectory(prefix=".restyling-", dir=runs) as hidden:
-            new = Path(hidden) / "run"  # not `hidden` itself, which nobody else may read
+        hidden = Path(tempfile.mkdtemp(prefix=".restyling-", dir=runs))
+        try:
+            new = hidden / "run"  # not `hidden` itself, which nobody else may read
             new.mkdir()
             painting = self._write_contents(new)
             while True:
@@ -196,6 +196,8 @@ class Restyling:
                     if not folder.exists():
                         raise
                     time.sleep(0.1)  # until the second is over in which another run began
+        finally:
+            shutil.rmtree(hidden, ignore_errors=True)
 
     def _write_contents(self, new: Path) -> Path:
         """Writes a run but for its config; returns where in it the painting lies."""

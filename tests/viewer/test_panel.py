@@ -67,6 +67,7 @@ def viewer_of(run: Path) -> Iterator[StylePanel]:
     try:
         yield pipeline.panel
     finally:
+        pipeline.panel.close()
         viewer.viser_server.stop()
 
 
@@ -268,6 +269,17 @@ def test_a_restyling_can_be_stopped_and_only_one_runs_at_a_time(
     assert len(panel.styles) == 1
 
 
+def test_closing_ends_what_is_at_work(patterned_run: Path) -> None:
+    with viewer_of(patterned_run) as panel:
+        panel.iterations.value = 100_000
+        panel.upload.received("a.png", png(1))
+        threads = [panel.baker, panel._restyler]
+        assert all(thread.is_alive() for thread in threads)
+        panel.close()
+        assert not any(thread.is_alive() for thread in threads)
+        assert panel.message.content == "Stopped; the style on the screen stays."
+
+
 def test_training_and_restyling_are_told_apart_and_their_last_step_always(
     panel: StylePanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -336,7 +348,7 @@ def own_style_alone(panel: StylePanel) -> Iterator[None]:
     "broken, error",
     [
         ("torch.save", RuntimeError("PytorchStreamWriter failed writing file\ndata/0")),
-        ("sparsestyle_ns.viewer.restyling.tempfile.TemporaryDirectory", OSError("no room")),
+        ("sparsestyle_ns.viewer.restyling.tempfile.mkdtemp", OSError("no room")),
         ("sparsestyle_ns.viewer.restyling.save_thumbnail", ValueError("anything else")),
     ],
 )
