@@ -137,6 +137,8 @@ class StylePanel(ViewerControl):
         self._stop.set()
         if self.baker is not None:
             self.baker.ending.set()
+        if self._busy.locked():
+            CONSOLE.print("The restyling is being stopped; Ctrl-C ends it at once.")
         for thread in (self.baker, self._restyler):
             if thread is not None:
                 thread.join(SECONDS_TO_END)
@@ -351,6 +353,8 @@ class StylePanel(ViewerControl):
                     self._let_pictures_pass()
             self._end(self._keep(restyling))
         except Exception as error:  # whatever it is, the viewer goes on
+            if not threading.main_thread().is_alive():
+                return  # Python's end has begun, and the controls don't work any more
             if not isinstance(error, InputError):
                 CONSOLE.print_exception()
             self._end(f"**Not restyled.** {plain(_sentence(error))}")
