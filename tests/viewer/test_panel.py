@@ -146,7 +146,7 @@ def test_volumes_are_filled_ahead_for_the_photos_cameras_and_those_between(
     panel: StylePanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sparsestyle_ns.viewer.panel.SECONDS_UNTIL_BAKING", 0.0)
-    end = time.monotonic() + 60
+    end = time.monotonic() + 240
     while not panel.baker.is_done():
         assert time.monotonic() < end
         time.sleep(0.05)
@@ -456,6 +456,19 @@ def test_restyling_takes_the_trainers_steps(runs: SimpleNamespace, painting: Pat
     assert steps[-1].done == 1.0 and steps[-1].seconds_left == 0.0
     for name, value in pipeline.model.residual.state_dict().items():
         assert torch.equal(restyling.field.state_dict()[name], value), name
+
+
+def test_a_restyling_sees_exact_views_between_the_photos_also_of_a_run_that_is_shown_baked(
+    panel: StylePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipeline = panel.pipeline
+    monkeypatch.setattr(pipeline.config, "novel_views", 1)
+    camera = pipeline._novel_cameras()[0]
+    with torch.no_grad():
+        exact = pipeline.model.get_outputs_for_camera(camera)["rgb_coarse"]
+        with pipeline.model.rendering("baked"):
+            assert not torch.equal(pipeline.model.get_outputs_for_camera(camera)["rgb_coarse"], exact)
+            assert torch.equal(pipeline._freeze_views()[-1].picture, exact)
 
 
 def test_random_numbers_of_training_go_on_as_if_there_were_no_restyling(panel: StylePanel) -> None:
