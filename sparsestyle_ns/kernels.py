@@ -4,6 +4,7 @@ Numba's own thread pools can't be entered from two threads at once, as a viewer 
 compiled for one thread, and the work is shared out here.
 """
 
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Callable, Sequence, Tuple
 
@@ -30,7 +31,8 @@ def run_on_threads(function: Callable[..., None], parts: Sequence[Tuple]) -> Non
     Parts must not write to the same places. An error in one is raised here.
     """
     threads = min(torch.get_num_threads(), len(parts))
-    if threads <= 1:
+    # Python's end has begun where the main thread is over, and then no pool takes work any more.
+    if threads <= 1 or not threading.main_thread().is_alive():
         for part in parts:
             function(*part)
         return

@@ -1,3 +1,5 @@
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -46,6 +48,27 @@ def test_one_thread_means_the_callers_own(two_threads):
     seen = []
     run_on_threads(lambda: seen.append(threading.current_thread()), [(), ()])
     assert seen == [threading.current_thread()] * 2
+
+
+def test_work_goes_on_while_python_ends():
+    """A thread that is at work then may come to its end: pools take no work any more."""
+    script = """
+import sys, threading, time
+import torch
+from sparsestyle_ns.kernels import run_on_threads
+
+def work():
+    threading.main_thread().join()
+    time.sleep(0.2)
+    done = []
+    run_on_threads(lambda: done.append(1), [(), ()])
+    print(len(done), flush=True)
+
+torch.set_num_threads(2)
+threading.Thread(target=work).start()
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert (ended.stdout, ended.stderr) == ("2\n", "")
 
 
 def test_an_error_in_a_part_is_raised(two_threads):

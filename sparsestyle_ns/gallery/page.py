@@ -5,7 +5,7 @@ without a network and can be sent as it is. This knows nothing of nerfstudio, on
 """
 
 import base64
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Dict, List, Optional, Sequence, Tuple
 
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.tables import Table
+from sparsestyle_ns.names import free_name
 from sparsestyle_ns.page import Pixels, figure, image, picture_page, table
 
 THUMBNAIL_SIDE = 224
@@ -83,7 +84,7 @@ class RunPictures:
         subtitle: a line on how it was made.
         photos: the photos it was trained on.
         views: viewpoints, the first of them shown large; at least one.
-        style_name: the painting's name.
+        style_name: the painting's name; on the page, another painting of that name gets a number behind it.
         style: the style image; None where its file is gone.
         style_note: said in its place.
         film: of the stylised scene.
@@ -114,12 +115,27 @@ def gallery_page(runs: Sequence[RunPictures], title: str) -> str:
         runs: what to show, in this order.
         title: the page's heading, plain text.
     """
-    several = len(runs) > 1
+    runs, several = _paintings_told_apart(runs), len(runs) > 1
     contents = _contents(runs) if several else ""
     sections = (_grid(runs) if several else "") + "".join(
         _section(run, _anchor(number)) for number, run in enumerate(runs, start=1)
     )
     return picture_page(title, contents, sections, _file("page.css"), _file("page.js"))
+
+
+def _paintings_told_apart(runs: Sequence[RunPictures]) -> List[RunPictures]:
+    """The runs, with one name for a painting and another for each other painting that is called the same."""
+    names: Dict[Tuple, str] = {}
+    for run in runs:
+        if _painting(run) not in names:
+            names[_painting(run)] = free_name(run.style_name, names.values())
+    return [replace(run, style_name=names[_painting(run)]) for run in runs]
+
+
+def _painting(run: RunPictures) -> Tuple:
+    """What makes a painting another one: its name or its pixels, as far as these are known."""
+    pixels = None if run.style is None else run.style.pixels
+    return run.style_name, None if pixels is None else (pixels.shape, pixels.tobytes())
 
 
 def _file(name: str) -> str:

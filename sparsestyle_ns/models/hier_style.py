@@ -301,11 +301,20 @@ class HierStyleModel(Model):
 
         return BakedVolume(shade, resolution, self.device)
 
+    def kept_volume(self, style: nn.Module) -> Optional[BakedVolume]:
+        """The baked volume of a style's next picture; None where that picture would start a new one, because it is the
+        style's first, its weights have changed, or `MOST_BAKED` other styles were shown since the last."""
+        return self._volume_of(style, self._state_of_weights(style))
+
+    def _volume_of(self, style: nn.Module, state: List[Tensor]) -> Optional[BakedVolume]:
+        volume, known = self._baked.get(style, (None, []))
+        return volume if volume is not None and all(map(torch.equal, known, state)) else None
+
     def _current_volume(self, style: nn.Module) -> BakedVolume:
         """A style's baked volume, a new one whenever what it shows has changed since the last picture."""
         state = self._state_of_weights(style)
-        volume, known = self._baked.get(style, (None, []))
-        if volume is None or not all(map(torch.equal, known, state)):
+        volume = self._volume_of(style, state)
+        if volume is None:
             volume = self.bake(self.config.bake_resolution, style)
         # The viewer may break a picture off between any two lines; here that loses nothing.
         self._baked = {

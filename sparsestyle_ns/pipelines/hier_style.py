@@ -269,7 +269,8 @@ class HierStylePipeline(CheckedPipeline):
             rays = bundle.flatten()
             frozen = self._freeze(rays.origins, rays.directions, keep_bytes)
             keep_bytes -= frozen.kept_bytes
-            outputs = self.model.get_outputs_for_camera_ray_bundle(bundle)
+            with self.model.rendering("exact"):  # a viewer may restyle a run whose pictures are baked
+                outputs = self.model.get_outputs_for_camera_ray_bundle(bundle)
             views.append(SceneView(frozen, outputs["rgb_coarse"], outputs["accumulation_coarse"].squeeze(-1)))
         return views
 

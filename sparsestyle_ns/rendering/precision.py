@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import threading
 from contextlib import AbstractContextManager, contextmanager
 from typing import Callable, Iterator, Literal, ParamSpec, TypeVar
 
@@ -32,7 +33,7 @@ def autocast(device: torch.device, precision: Precision) -> AbstractContextManag
     `auto` is bfloat16 where the device multiplies it (`multiplies_bfloat16`), else float32.
     """
     if precision == "tf32":
-        return _tensor_float32()
+        return TENSOR_FLOAT32.allowed()
     enabled = precision == "bfloat16" or (precision == "auto" and multiplies_bfloat16(device))
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=enabled)
 
@@ -42,14 +43,35 @@ def multiplies_tf32(device: torch.device) -> bool:
     return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
 
 
-@contextmanager
-def _tensor_float32() -> Iterator[None]:
-    products = torch.backends.cuda.matmul
-    before, products.allow_tf32 = products.allow_tf32, True
-    try:
-        yield
-    finally:
-        products.allow_tf32 = before
+class TensorFloat32:
+    """torch's switch for TF32 products, of which there is one for all threads.
+
+    It is on while any thread is within `allowed`, and afterwards as before. What another thread multiplies outside
+    meanwhile, such as a backward pass beside a viewer's picture, is multiplied in TF32 too.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._within, self._before = 0, False
+
+    @contextmanager
+    def allowed(self) -> Iterator[None]:
+        """A context in which products run in TF32; several threads may be in it, and one several times."""
+        products = torch.backends.cuda.matmul
+        with self._lock:
+            if self._within == 0:
+                self._before, products.allow_tf32 = products.allow_tf32, True
+            self._within += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._within -= 1
+                if self._within == 0:
+                    products.allow_tf32 = self._before
+
+
+TENSOR_FLOAT32 = TensorFloat32()
 
 
 def at_least_float32(values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

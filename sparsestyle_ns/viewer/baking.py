@@ -6,13 +6,16 @@ one that sees it again doesn't. So the time in which nobody moves anything goes 
 
 import threading
 import time
-from typing import Any, Callable, ContextManager, Iterator, List, Optional, Tuple
+from typing import Any, Callable, ContextManager, Iterator, List, Optional, Set, Tuple
+from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.camera_utils import get_interpolated_poses
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
+
+from sparsestyle_ns.rendering.baked import BakedVolume
 
 SIDE = 252
 """Longer side of the pictures whose voxels are filled in: with a volume of 256 cells a side, one ray for each cell."""
@@ -65,39 +68,57 @@ class Baker(threading.Thread):
         super().__init__(name="baking", daemon=True)
         self.model, self.shown, self.is_free, self.lock = model, shown, is_free, lock
         self.cameras = likely_cameras(cameras)
-        self.filled: List[Tuple[nn.Module, int]] = []
-        """Styles and cameras whose rays have all been followed."""
+        self.filled: WeakKeyDictionary[BakedVolume, Set[int]] = WeakKeyDictionary()
+        """The cameras whose rays have all been followed in a volume, for as long as the model keeps that."""
+        self.ending = threading.Event()
+        """Ends it."""
 
     def run(self) -> None:
-        """Works until the process ends."""
-        while True:
-            task = self._next()
-            if task is None or not self.is_free():
-                time.sleep(0.1)
-                continue
-            style, number = task
-            if all(self._follow(style, *rays) for rays in _rays(self.cameras[number], self.model.device)):
-                self.filled.append(task)
+        """Works until it is to end."""
+        while not self.ending.is_set():
+            task = self._next() if self.is_free() else None
+            if task is None:
+                self.ending.wait(0.1)
+            else:
+                self._fill(*task)
 
     def is_done(self) -> bool:
         """Whether all is filled that the styles on the screen need."""
         return self._next() is None
 
     def _next(self) -> Optional[Tuple[nn.Module, int]]:
-        tasks = ((style, number) for number in range(len(self.cameras)) for style in self.shown())
-        return next((task for task in tasks if task not in self.filled), None)
+        """A style on the screen, and the number of a camera that its volume isn't filled for."""
+        filled = [(style, self._filled_for(style)) for style in self.shown()]
+        numbers = range(len(self.cameras))
+        return next(((style, number) for number in numbers for style, known in filled if number not in known), None)
+
+    def _filled_for(self, style: nn.Module) -> Set[int]:
+        volume = self.model.kept_volume(style)
+        return set() if volume is None else self.filled.get(volume, set())
+
+    def _fill(self, style: nn.Module, number: int) -> None:
+        """Follows a camera's rays, as long as the style is shown and its volume stays the same."""
+        followed: Optional[BakedVolume] = None
+        for rays in _rays(self.cameras[number], self.model.device):
+            volume = self._follow(style, *rays)
+            if volume is None or followed not in (None, volume):
+                return
+            followed = volume
+        self.filled.setdefault(followed, set()).add(number)
 
     @torch.no_grad()
-    def _follow(self, style: nn.Module, origins: Tensor, directions: Tensor) -> bool:
-        """Fills what these rays meet, once there is time; False where the style isn't shown any more."""
-        while not self.is_free():
-            time.sleep(0.1)
-        if style not in self.shown():
-            return False
+    def _follow(self, style: nn.Module, origins: Tensor, directions: Tensor) -> Optional[BakedVolume]:
+        """Fills what these rays meet, once there is time, and returns in which volume; None where the style isn't
+        shown any more, or it is to end."""
+        while not self.is_free() and not self.ending.wait(0.1):
+            pass
+        if self.ending.is_set() or style not in self.shown():
+            return None
         with self.lock:
             self.model.fill_baked(origins, directions, style)
+            volume = self.model.kept_volume(style)
         time.sleep(0.005)  # whoever waits for the lock gets it
-        return True
+        return volume
 
 
 def _rays(camera: Cameras, device: torch.device) -> Iterator[Tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]]:

@@ -1,5 +1,6 @@
 """The "Style" panel of `hier-style` in nerfstudio's viewer, in ns-train and ns-viewer alike."""
 
+import atexit
 import math
 import threading
 import time
@@ -26,6 +27,7 @@ from torch import nn
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.models.hier_style import RENDER_MODES, Look
+from sparsestyle_ns.names import free_name
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.viewer.baking import Baker
 from sparsestyle_ns.viewer.elements import Markdown, ProgressBar, UploadButton
@@ -35,13 +37,12 @@ from sparsestyle_ns.viewer.styles import (
     StyleImage,
     checkpoint_notes,
     find_thumbnail,
-    free_name,
     plain,
-    run_facts,
+    style_facts,
 )
 
 NO_BLEND = "nothing"
-"""What a style is blended with at first."""
+"""What a style is blended with at first; no style has this name."""
 OUTPUTS = ["rgb", "rgb_coarse", "accumulation", "depth", "accumulation_coarse", "depth_coarse"]
 """The model's, those first that are looked at most."""
 SECONDS_BETWEEN_TEXTS = 0.5
@@ -50,6 +51,8 @@ SECONDS_AT_REST = 0.3
 """A restyling goes on when nothing was moved for so long: a picture on the way needs the processor."""
 SECONDS_UNTIL_BAKING = 2.0
 """Volumes are filled ahead when nothing was moved for so long, so that the still picture comes first."""
+SECONDS_TO_END = 60.0
+"""What is at work when the viewer ends gets so long to come to an end."""
 MAX_SIDE_ON_CPU = 256
 """Longer side of still pictures where there is no GPU; nerfstudio's own is 512."""
 
@@ -98,9 +101,12 @@ class StylePanel(ViewerControl):
         self.bar, self.message = ProgressBar(), Markdown()
         self.styles: List[Style] = []
         self.viewer: Any = None
+        self.baker: Optional[Baker] = None
         self._workshop: Optional[Workshop] = None
+        self._restyler: Optional[threading.Thread] = None
         self._stop, self._busy = threading.Event(), threading.Lock()
-        self._last_change = self._last_text = 0.0
+        self._last_change = 0.0
+        self._losses_told, self._progress_told = Pace(), Pace()
         self._described = False
 
     # Making the panel
@@ -119,7 +125,23 @@ class StylePanel(ViewerControl):
             cameras = self.pipeline.datamanager.train_dataset.cameras
             self.baker = Baker(self.pipeline.model, cameras, self._shown, self._is_free, self._lock())
             self.baker.start()
+        atexit.register(self.close)
         viewer.viser_server.on_client_connect(self._welcome)
+
+    def close(self) -> None:
+        """Ends what is at work in the background and waits for that; a style that is being saved is saved.
+
+        Python calls it at its end: a thread that is in the middle of torch then would abort the process.
+        """
+        atexit.unregister(self.close)
+        self._stop.set()
+        if self.baker is not None:
+            self.baker.ending.set()
+        if self._busy.locked():
+            CONSOLE.print("The restyling is being stopped; Ctrl-C ends it at once.")
+        for thread in (self.baker, self._restyler):
+            if thread is not None:
+                thread.join(SECONDS_TO_END)
 
     def _take_defaults(self) -> None:
         if self.pipeline.device.type == "cpu":
@@ -144,14 +166,12 @@ class StylePanel(ViewerControl):
         else:
             notes = trainer.notes() if self.pipeline.targets is not None else {}
         if not self.styles:
-            name = "this run" if config.style_image is None else config.style_image.stem
+            name = self._free_name("this run" if config.style_image is None else config.style_image.stem)
             self.styles.append(Style(name, self.pipeline.model.residual))
             self._offer_styles(name)
-        own = self.styles[0]
-        own.facts, own.thumbnail = (
-            run_facts(self.folder, config.style_image, notes),
-            find_thumbnail(self.folder, config.style_image),
-        )
+        own, painting = self.styles[0], None if config.style_image is None else config.style_image.name
+        own.facts = style_facts(painting, str(self.folder), notes)
+        own.thumbnail = find_thumbnail(self.folder, config.style_image)
         self._show_description()
 
     def _install(self) -> None:
@@ -228,6 +248,10 @@ class StylePanel(ViewerControl):
     def _named(self, name: str) -> Optional[Style]:
         return next((style for style in self.styles if style.name == name), None)
 
+    def _free_name(self, name: str) -> str:
+        """A name by which a new style can be told from the others and from none."""
+        return free_name(name, [NO_BLEND, *(style.name for style in self.styles)])
+
     def _changed(self) -> None:
         self._last_change = time.monotonic()
         self.viewer._trigger_rerender()
@@ -268,15 +292,16 @@ class StylePanel(ViewerControl):
         Args:
             losses: a `StepLosses`.
         """
-        if self.viewer is None or time.monotonic() - self._last_text < SECONDS_BETWEEN_TEXTS:
+        if self.viewer is None:
             return
-        self._last_text = time.monotonic()
+        total = self.viewer.trainer._total
+        if not self._losses_told.is_due(at_once=losses.step + 1 == total):
+            return
         if not self._described:
             self._described = True
             self._describe_run()
             self.training.set_visible(True)
         content, style = float(losses.content.detach()), float(losses.style.detach())
-        total = self.viewer.trainer._total
         self.training.content = _loss_text(
             f"Iteration {losses.step + 1} of {total}", losses.content_weight, content, style
         )
@@ -306,7 +331,8 @@ class StylePanel(ViewerControl):
             return
         self._stop.clear()
         self.stop.set_visible(True)
-        threading.Thread(target=self._work, args=(restyling,), name="restyling", daemon=True).start()
+        self._restyler = threading.Thread(target=self._work, args=(restyling,), name="restyling", daemon=True)
+        self._restyler.start()
 
     def _new_restyling(self, image: StyleImage) -> Restyling:
         if self._workshop is None:
@@ -327,6 +353,8 @@ class StylePanel(ViewerControl):
                     self._let_pictures_pass()
             self._end(self._keep(restyling))
         except Exception as error:  # whatever it is, the viewer goes on
+            if not threading.main_thread().is_alive():
+                return  # Python's end has begun, and the controls don't work any more
             if not isinstance(error, InputError):
                 CONSOLE.print_exception()
             self._end(f"**Not restyled.** {plain(_sentence(error))}")
@@ -350,7 +378,7 @@ class StylePanel(ViewerControl):
         return self.mode.value == "baked" and idle and not trains
 
     def _keep(self, restyling: Restyling) -> str:
-        """Adds the new style, shows it, and saves it; what came of that."""
+        """Adds the new style, which stays even where it can't be saved, and shows it; what came of that."""
         image = restyling.image
         notes = {
             "step": restyling.iterations - 1,
@@ -358,20 +386,24 @@ class StylePanel(ViewerControl):
             "coarse_run": str(self.pipeline.config.coarse_run),
         }
         try:
-            folder, ending = restyling.save(), ""
-        except OSError as error:
-            folder, ending = self.folder, f" It is **not saved**, {plain(str(error))}, and gone when the viewer ends."
-        name = free_name(Path(image.name).stem, [style.name for style in self.styles])
-        facts = run_facts(folder, Path(image.name), notes)
+            run = str(restyling.save())
+            ending = f"Saved as a run of its own: {plain(run)}"
+        except Exception as error:  # whatever it is, the style is worth more than its copy on the disk
+            if not isinstance(error, (OSError, RuntimeError)):
+                CONSOLE.print_exception()
+            reason = _in_one_line(error)
+            run = f"not saved ({reason})"
+            ending = f"It is **not saved** ({plain(reason)}), and gone when the viewer ends."
+        name = self._free_name(Path(image.name).stem)
+        facts = style_facts(image.name, run, notes)
         with self._lock():
             self.styles.append(Style(name, restyling.field, facts, image.thumbnail()))
         self._offer_styles(name)
-        return f"**{plain(name)}** is ready." + (ending or f" Saved as a run of its own: {plain(str(folder))}")
+        return f"**{plain(name)}** is ready. {ending}"
 
     def _tell(self, progress: Progress) -> None:
-        if progress.losses is not None and time.monotonic() - self._last_text < SECONDS_BETWEEN_TEXTS:
+        if not self._progress_told.is_due(at_once=progress.losses is None or progress.done == 1.0):
             return
-        self._last_text = time.monotonic()
         self.bar.show(progress.done)
         text = f"Restyling. {progress.words}"
         if progress.losses is not None:
@@ -382,6 +414,21 @@ class StylePanel(ViewerControl):
         self.message.content = message
         self.bar.show(None)
         self.stop.set_visible(False)
+
+
+class Pace:
+    """Keeps something from being told more often than every `SECONDS_BETWEEN_TEXTS`."""
+
+    def __init__(self) -> None:
+        self._last = -math.inf
+
+    def is_due(self, at_once: bool) -> bool:
+        """Whether to tell it now, which counts as told then; always with `at_once`."""
+        now = time.monotonic()
+        if not at_once and now - self._last < SECONDS_BETWEEN_TEXTS:
+            return False
+        self._last = now
+        return True
 
 
 def _loss_text(what: str, weight: float, content: float, style: float) -> str:
@@ -402,7 +449,11 @@ def _minutes(seconds: float) -> str:
 
 def _sentence(error: Exception) -> str:
     """An error in one sentence; what isn't the user's input keeps its kind."""
-    text = " ".join(str(error).split()) or type(error).__name__
+    text = _in_one_line(error)
     if isinstance(error, InputError):
         return text
     return f"Something went wrong in restyling, and the style on the screen stays ({type(error).__name__}: {text})."
+
+
+def _in_one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -7,6 +7,7 @@ model and what is trained or shown meanwhile are only read, so that no lock is h
 
 import functools
 import shutil
+import tempfile
 import time
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
@@ -24,6 +25,7 @@ from sparsestyle_ns.effects.registry import decide_again
 from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.files import write_whole
 from sparsestyle_ns.finite_steps import FiniteOptimizers
+from sparsestyle_ns.names import safe_file_name
 from sparsestyle_ns.processes import num_processes
 from sparsestyle_ns.scene_record import FILE_NAME as SCENE_RECORD
 from sparsestyle_ns.style.vgg import VGGFeatures
@@ -35,6 +37,8 @@ RESIDUAL = "_model.residual."
 """What the names of a stylised field's tensors start with in a checkpoint."""
 BESIDE_CHECKPOINTS = (SCENE_RECORD, "dataparser_transforms.json")
 """Files of a run that say nothing of the style."""
+PAINTING_FOLDER = "style_image"
+"""Of a run's folder, where its painting lies under the name that it came with: no name can be that of another file."""
 
 
 @dataclass(frozen=True)
@@ -169,34 +173,55 @@ class Restyling:
     def save(self) -> Path:
         """Saves the style as a run of its own beside the one in the viewer, for ns-render, ns-viewer and the rest.
 
+        The run is there as a whole or not at all: it is made in a hidden folder, which goes when something fails.
+
         Returns:
             The new run's folder.
 
         Raises:
-            OSError: it can't be written.
+            OSError, RuntimeError: it can't be written; torch's writer makes the second of some of the first.
         """
+        runs = self.workshop.folder.parent
+        hidden = Path(tempfile.mkdtemp(prefix=".restyling-", dir=runs))
+        try:
+            new = hidden / "run"  # not `hidden` itself, which nobody else may read
+            new.mkdir()
+            painting = self._write_contents(new)
+            while True:
+                folder = runs / datetime.now().strftime("%Y-%m-%d_%H%M%S")  # as nerfstudio names them
+                self._write_config(new, folder.resolve(), painting)
+                try:
+                    return new.rename(folder)
+                except OSError:
+                    if not folder.exists():
+                        raise
+                    time.sleep(0.1)  # until the second is over in which another run began
+        finally:
+            shutil.rmtree(hidden, ignore_errors=True)
+
+    def _write_contents(self, new: Path) -> Path:
+        """Writes a run but for its config; returns where in it the painting lies."""
         from sparsestyle_ns.trainer import without_numpy_scalars  # which needs the pipelines, and they this package
 
-        folder = self.workshop.folder
-        new = _free_folder(folder.parent)
-        suffix = Path(self.image.name).suffix
-        painting = write_whole(new / f"style_image{suffix}", self.image.data)
+        painting = Path(PAINTING_FOLDER) / safe_file_name(self.image.name, "painting")
+        write_whole(new / painting, self.image.data)
         save_thumbnail(new, self.image)
         for name in BESIDE_CHECKPOINTS:
-            if (folder / name).is_file():
-                shutil.copy(folder / name, new / name)
+            if (self.workshop.folder / name).is_file():
+                shutil.copy(self.workshop.folder / name, new / name)
         self.effects.save(new)
-        config = self.config
-        config.timestamp, config.max_num_iterations = new.name, self.iterations
-        config.load_dir = config.load_step = config.load_checkpoint = None
-        config.pipeline.style_image, config.pipeline.decided = painting.resolve(), self.effects
-        write_whole(new / "config.yml", yaml.dump(config))
         step = self.iterations - 1
-        path = new / config.relative_model_dir / f"step-{step:09d}.ckpt"
-        write_whole(
-            path, lambda file: torch.save(without_numpy_scalars(self._state(step)), file), new / "checkpoint.unfinished"
-        )
-        return new
+        path = new / self.config.relative_model_dir / f"step-{step:09d}.ckpt"
+        write_whole(path, lambda file: torch.save(without_numpy_scalars(self._state(step)), file))
+        return painting
+
+    def _write_config(self, new: Path, folder: Path, painting: Path) -> None:
+        """Writes the config of a run that will lie in `folder`."""
+        config = self.config
+        config.timestamp, config.max_num_iterations = folder.name, self.iterations
+        config.load_dir = config.load_step = config.load_checkpoint = None
+        config.pipeline.style_image, config.pipeline.decided = folder / painting, self.effects
+        write_whole(new / "config.yml", yaml.dump(config))
 
     def _state(self, step: int) -> Dict[str, Any]:
         """A checkpoint like the trainer's."""
@@ -213,14 +238,3 @@ class Restyling:
             "coarse_field": asdict(self.config.pipeline.model.coarse_field),
             "fine_encoding": self.config.pipeline.model.fine_encoding,
         }
-
-
-def _free_folder(parent: Path) -> Path:
-    """A folder for a new run, named by the time as nerfstudio's are; made, so that no other run takes it."""
-    while True:
-        folder = parent / datetime.now().strftime("%Y-%m-%d_%H%M%S")
-        try:
-            folder.mkdir(parents=True)
-            return folder
-        except FileExistsError:
-            time.sleep(0.1)

@@ -5,7 +5,7 @@ import io
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Dict, Iterable, List, Optional, Tuple
+from typing import Any, Dict, List, Optional, Tuple
 
 from jaxtyping import Float
 from PIL import Image
@@ -118,24 +118,15 @@ def plain(text: str) -> str:
     return re.sub(r"(/|\\_)", r"\1<wbr />", escaped)
 
 
-def free_name(name: str, taken: Iterable[str]) -> str:
-    """A name that isn't taken: this, else with a number behind it."""
-    taken, number = set(taken), 2
-    found = name
-    while found in taken:
-        found, number = f"{name} {number}", number + 1
-    return found
-
-
-def run_facts(folder: Path, style_image: Optional[Path], notes: Dict[str, Any]) -> Facts:
-    """What made a run's style.
+def style_facts(painting: Optional[str], run: str, notes: Dict[str, Any]) -> Facts:
+    """What made a style.
 
     Args:
-        folder: the run's.
-        style_image: its painting.
+        painting: its file's name.
+        run: the run's folder, or why there is none.
         notes: of its checkpoint, or of its trainer.
     """
-    facts = [("Painting", "not known" if style_image is None else style_image.name), ("Run", str(folder))]
+    facts = [("Painting", painting or "not known"), ("Run", run)]
     if "step" in notes:
         facts.append(("Iterations", str(notes["step"] + 1)))
     if "backbone" in notes:

@@ -161,9 +161,8 @@ def grid_of(runs):
 
 
 def test_the_grid_has_scenes_down_and_paintings_across_with_gaps_where_there_is_no_run():
-    night, hat = make_run(), make_run(style_name="hat", style=Picture(make_pixels(21), "hat.jpg"))
-    flower = make_run(name="flower", style_name="hat")
-    again = make_run(name="flower", style_name="hat")
+    hat = {"style_name": "hat", "style": Picture(make_pixels(21), "hat.jpg")}
+    night, hat, flower, again = make_run(), make_run(**hat), *(make_run(name="flower", **hat) for _ in range(2))
     cells, headings, grid = grid_of([night, hat, flower, again])
     assert cells == [[["1"], ["2"]], [[], ["3", "4"]]]
     assert headings == ["night", "hat", "fern", "flower"]
@@ -171,6 +170,21 @@ def test_the_grid_has_scenes_down_and_paintings_across_with_gaps_where_there_is_
     assert data_uri(make_pixels(20)) in sources  # paintings
     assert data_uri(make_pixels(11)) in sources  # the scene as it was
     assert data_uri(make_pixels(10)) in sources  # and stylised
+
+
+def test_two_paintings_of_one_name_have_a_column_and_a_name_each():
+    hats = [Picture(make_pixels(seed), "hat.jpg") for seed in (21, 22, 21)]
+    gone = make_run(style_name="hat", style=None)  # nobody knows which of them it was
+    runs = [*(make_run(style_name="hat", style=hat) for hat in hats), gone, make_run(style_name="hat 2", style=hats[0])]
+    cells, headings, grid = grid_of(runs)
+    assert cells == [[["1", "3"], ["2"], ["4"], ["5"]]]
+    assert headings == ["hat", "hat 2", "hat 3", "hat 2 2", "fern"]
+    sources = re.findall(r'src="([^"]+)"', grid)
+    assert [sources.index(data_uri(make_pixels(seed))) for seed in (21, 22)] == [0, 1]
+    texts = Page(gallery_page(runs, "Scenes")).texts
+    assert texts.count("fern · hat") == 4  # two sections, and two links to them
+    assert texts.count("fern · hat 2") == texts.count("fern · hat 2 2") == 2
+    assert runs[1].style_name == "hat"
 
 
 def test_one_run_has_no_grid():

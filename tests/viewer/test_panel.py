@@ -1,11 +1,16 @@
 """The Style panel, in nerfstudio's own viewer but without a browser: its controls are moved from here."""
 
+import gc
 import io
 import json
 import os
+import shutil
 import threading
 import time
+import weakref
 from contextlib import contextmanager
+from copy import deepcopy
+from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Callable, Iterator, List
@@ -21,11 +26,15 @@ from nerfstudio.viewer.viewer import Viewer
 from PIL import Image
 
 from sparsestyle_ns.evaluation.training import Training
+from sparsestyle_ns.export.command import load_scene
+from sparsestyle_ns.gallery.collect import collect_run
+from sparsestyle_ns.models.hier_style import MOST_BAKED
+from sparsestyle_ns.pipelines.hier_style import StepLosses
 from sparsestyle_ns.run_folder import find_config, load_run
 from sparsestyle_ns.viewer.baking import STEPS_BETWEEN
 from sparsestyle_ns.viewer.panel import NO_BLEND, StylePanel
-from sparsestyle_ns.viewer.restyling import Restyling, Workshop
-from sparsestyle_ns.viewer.styles import StyleImage, free_name, plain
+from sparsestyle_ns.viewer.restyling import Progress, Restyling, Workshop
+from sparsestyle_ns.viewer.styles import Style, StyleImage, plain
 
 
 class Drawing(RenderStateMachine):
@@ -58,6 +67,7 @@ def viewer_of(run: Path) -> Iterator[StylePanel]:
     try:
         yield pipeline.panel
     finally:
+        pipeline.panel.close()
         viewer.viser_server.stop()
 
 
@@ -136,17 +146,51 @@ def test_volumes_are_filled_ahead_for_the_photos_cameras_and_those_between(
     panel: StylePanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sparsestyle_ns.viewer.panel.SECONDS_UNTIL_BAKING", 0.0)
-    end = time.monotonic() + 60
+    end = time.monotonic() + 240
     while not panel.baker.is_done():
         assert time.monotonic() < end
         time.sleep(0.05)
     assert len(panel.baker.cameras) == 3 + 2 * STEPS_BETWEEN
+    (filled,) = panel.baker.filled.values()
+    assert filled == set(range(len(panel.baker.cameras)))
     monkeypatch.setattr(panel.pipeline.model.field, "density_and_feature", None)
     bundle = panel.baker.cameras[-1].generate_rays(camera_indices=0, keep_shape=True)
     thread = Drawing(lambda: panel.pipeline.model.get_outputs_for_camera_ray_bundle(bundle)["rgb"])
     thread.start()
     thread.join()
     assert max(thread.result.shape) == 252 and thread.result.std() > 0.05
+
+
+def test_a_style_whose_volume_was_thrown_away_is_filled_ahead_again(
+    panel: StylePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = panel.pipeline.model
+    styles = [panel.styles[0], *(Style(str(number), model.new_style()) for number in range(MOST_BAKED))]
+    monkeypatch.setattr(panel, "styles", styles)
+    small = deepcopy(panel.baker.cameras[0])
+    small.rescale_output_resolution(0.1)
+    monkeypatch.setattr(panel.baker, "cameras", [small])
+    model._baked.clear()
+
+    def look_at(style: Style) -> None:
+        panel.style.value = style.name
+        assert not panel.baker.is_done()  # what was filled is gone, or never was there
+        monkeypatch.setattr("sparsestyle_ns.viewer.panel.SECONDS_UNTIL_BAKING", 0.0)
+        end = time.monotonic() + 60
+        while not panel.baker.is_done():
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        monkeypatch.setattr("sparsestyle_ns.viewer.panel.SECONDS_UNTIL_BAKING", 1e9)
+
+    for style in [*styles, styles[0]]:
+        look_at(style)
+    assert len(panel.baker.filled) == len(model._baked) == MOST_BAKED
+    panel.style.value = styles[-1].name
+    assert panel.baker.is_done()  # one of the latest
+    forgotten = weakref.ref(styles.pop(1).field)
+    del style
+    gc.collect()
+    assert forgotten() is None
 
 
 def test_the_panel_says_what_made_the_style(panel: StylePanel) -> None:
@@ -225,6 +269,34 @@ def test_a_restyling_can_be_stopped_and_only_one_runs_at_a_time(
     assert len(panel.styles) == 1
 
 
+def test_closing_ends_what_is_at_work(patterned_run: Path) -> None:
+    with viewer_of(patterned_run) as panel:
+        panel.iterations.value = 100_000
+        panel.upload.received("a.png", png(1))
+        threads = [panel.baker, panel._restyler]
+        assert all(thread.is_alive() for thread in threads)
+        panel.close()
+        assert not any(thread.is_alive() for thread in threads)
+        assert panel.message.content == "Stopped; the style on the screen stays."
+
+
+def test_training_and_restyling_are_told_apart_and_their_last_step_always(
+    panel: StylePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sparsestyle_ns.viewer.panel.SECONDS_BETWEEN_TEXTS", 1e9)
+    trainer = SimpleNamespace(_total=9, notes=dict, training_state="completed")
+    monkeypatch.setattr(panel.viewer, "trainer", trainer)
+    monkeypatch.setattr(panel, "_described", True)
+    told: List[str] = []
+    for step in (0, 1, 8):
+        content, style = torch.tensor([2.0, 3.0])
+        panel._tell(Progress("Iteration", step / 8, 1.0, (4.0, 5.0, 6.0)))
+        panel.show_losses(StepLosses(step, 1.0, content, style))
+        told += [panel.training.content.split(":")[0], f"{panel.bar.gui_handle.value:.0f}"]
+    panel._end("")
+    assert told == ["Iteration 1 of 9", "0", "Iteration 1 of 9", "0", "Iteration 9 of 9", "100"]
+
+
 def test_restyling_gives_a_style_that_blends_and_a_run_that_renders(
     panel: StylePanel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -249,25 +321,89 @@ def test_restyling_gives_a_style_that_blends_and_a_run_that_renders(
     saved = max(panel.folder.parent.glob("20*"))
     assert str(saved) in said
     _, pipeline, step = load_run(saved / "config.yml")
-    assert step == 2 and pipeline.config.style_image == saved / "style_image.png"
+    assert step == 2 and pipeline.config.style_image.read_bytes() == png(3)
     camera = pipeline.datamanager.train_dataset.cameras[:1]
     with pipeline.model.rendering("baked"):
         assert torch.equal(pipeline.model.get_outputs_for_camera(camera)["rgb"], second)
     render(saved, tmp_path / "pictures")
     assert len(list((tmp_path / "pictures").rglob("*.jpg"))) == 1
 
+    # Everything calls it by its painting, and whoever may read the first run may read this one.
+    assert collect_run(saved, num_views=1, frames=0).style_name == "other painting"
+    assert load_scene(saved / "config.yml").title == "scene · other painting"
+    assert saved.stat().st_mode == panel.folder.stat().st_mode
+    assert not list(saved.parent.glob(".*"))
 
-def test_a_style_that_cant_be_saved_is_there_and_says_so(panel: StylePanel, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(_: Restyling) -> Path:
-        raise OSError("no room")
 
-    monkeypatch.setattr(Restyling, "save", full)
+@pytest.fixture
+def own_style_alone(panel: StylePanel) -> Iterator[None]:
+    """Takes styles that a test adds from the list again."""
     count = len(panel.styles)
-    panel.upload.received("other painting.png", png(3))
-    assert "**not saved**, no room," in wait_for(panel)
-    assert len(panel.styles) == count + 1
-    panel.styles.pop()
+    yield
+    del panel.styles[count:]
     panel._offer_styles(panel.styles[0].name)
+
+
+@pytest.mark.parametrize(
+    "broken, error",
+    [
+        ("torch.save", RuntimeError("PytorchStreamWriter failed writing file\ndata/0")),
+        ("sparsestyle_ns.viewer.restyling.tempfile.mkdtemp", OSError("no room")),
+        ("sparsestyle_ns.viewer.restyling.save_thumbnail", ValueError("anything else")),
+    ],
+)
+def test_a_style_that_cant_be_saved_is_there_and_says_so_and_leaves_no_folder(
+    panel: StylePanel, own_style_alone: None, monkeypatch: pytest.MonkeyPatch, broken: str, error: Exception
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    folders = set(panel.folder.parent.iterdir())
+    count = len(panel.styles)
+    monkeypatch.setattr(broken, fail)
+    panel.upload.received("unsaved.png", png(3))
+    reason = " ".join(str(error).split())
+    assert wait_for(panel) == f"**unsaved** is ready. It is **not saved** ({reason}), and gone when the viewer ends."
+    assert set(panel.folder.parent.iterdir()) == folders
+    assert len(panel.styles) == count + 1 and panel.style.value == "unsaved"
+    assert ("Run", f"not saved ({reason})") in panel.styles[-1].facts
+    assert str(panel.folder) not in shown_text(panel.description.content)
+
+
+def test_two_restylings_of_a_second_are_two_runs(panel: StylePanel, monkeypatch: pytest.MonkeyPatch) -> None:
+    class StandingClock(datetime):
+        times = iter([datetime(2020, 1, 1)] * 3 + [datetime(2020, 1, 2)])
+
+        @classmethod
+        def now(cls) -> datetime:
+            return next(cls.times)
+
+    monkeypatch.setattr("sparsestyle_ns.viewer.restyling.datetime", StandingClock)
+    restyling = Restyling(panel._workshop, StyleImage.received("a.png", png(1)), iterations=1)
+    for _ in restyling:
+        pass
+    saved = [restyling.save(), restyling.save()]
+    assert [folder.name for folder in saved] == ["2020-01-01_000000", "2020-01-02_000000"]
+    for folder in saved:
+        config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+        assert config.timestamp == folder.name and config.pipeline.style_image.is_relative_to(folder)
+        assert config.pipeline.style_image.read_bytes() == png(1)
+        shutil.rmtree(folder)
+
+
+def test_a_painting_called_nothing_is_blended_in_only_when_it_is_chosen(
+    panel: StylePanel, own_style_alone: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Restyling, "save", lambda _: panel.folder)
+    panel.upload.received(f"{NO_BLEND}.png", png(3))
+    assert wait_for(panel).startswith(f"**{NO_BLEND} 2** is ready.")
+    panel.style.value = panel.styles[0].name
+    assert panel._shown() == (panel.pipeline.model.residual,)
+    # The run's own painting may be called that, too.
+    monkeypatch.setattr(panel, "styles", [])
+    monkeypatch.setattr(panel.pipeline.config, "style_image", Path(f"{NO_BLEND}.png"))
+    panel._describe_run()
+    assert [style.name for style in panel.styles] == [f"{NO_BLEND} 2"]
 
 
 def render(run: Path, output: Path) -> None:
@@ -322,6 +458,19 @@ def test_restyling_takes_the_trainers_steps(runs: SimpleNamespace, painting: Pat
         assert torch.equal(restyling.field.state_dict()[name], value), name
 
 
+def test_a_restyling_sees_exact_views_between_the_photos_also_of_a_run_that_is_shown_baked(
+    panel: StylePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipeline = panel.pipeline
+    monkeypatch.setattr(pipeline.config, "novel_views", 1)
+    camera = pipeline._novel_cameras()[0]
+    with torch.no_grad():
+        exact = pipeline.model.get_outputs_for_camera(camera)["rgb_coarse"]
+        with pipeline.model.rendering("baked"):
+            assert not torch.equal(pipeline.model.get_outputs_for_camera(camera)["rgb_coarse"], exact)
+            assert torch.equal(pipeline._freeze_views()[-1].picture, exact)
+
+
 def test_random_numbers_of_training_go_on_as_if_there_were_no_restyling(panel: StylePanel) -> None:
     torch.manual_seed(1)
     expected = torch.rand(3)
@@ -329,10 +478,6 @@ def test_random_numbers_of_training_go_on_as_if_there_were_no_restyling(panel: S
     fields = [panel._workshop.new_field() for _ in range(2)]
     assert torch.equal(torch.rand(3), expected)
     assert all(map(torch.equal, fields[0].parameters(), fields[1].parameters()))
-
-
-def test_names_are_told_apart() -> None:
-    assert [free_name("a", ["b"]), free_name("a", ["a"]), free_name("a", ["a", "a 2"])] == ["a", "a 2", "a 3"]
 
 
 def test_markdown_leaves_plain_text_alone() -> None:

@@ -1,0 +1,39 @@
+"""The viewer's process ends as it should while the panel's threads are at work."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+SCRIPT = """
+import sys, threading, time
+from pathlib import Path
+
+import torch
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.viewer.viewer import Viewer
+
+from sparsestyle_ns.run_folder import load_run
+
+run, painting = Path(sys.argv[1]), sys.argv[2]
+torch.set_num_threads(2)
+_, pipeline, _ = load_run(run / "config.yml")
+Viewer(ViewerConfig(websocket_host="127.0.0.1"), run / "viewer.txt", run, pipeline, train_lock=threading.Lock())
+panel = pipeline.panel
+panel.iterations.value, panel.path.value = 100000, painting
+panel.start.cb_hook(panel.start)
+while "Iteration 2" not in panel.message.content:
+    time.sleep(0.01)
+print("closing")
+raise KeyboardInterrupt  # as in ns-viewer's main thread on Ctrl-C
+"""
+
+
+def test_ctrl_c_while_restyling_ends_the_process_without_a_crash(patterned_run: Path, painting: Path) -> None:
+    command = [sys.executable, "-c", SCRIPT, str(patterned_run), str(painting)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert "closing" in ended.stdout, ended.stderr
+    # Python's own end after Ctrl-C; where a thread is left in the middle of torch, C++ aborts the process.
+    assert "Traceback" not in ended.stdout
+    assert ended.stderr.rstrip().endswith("KeyboardInterrupt"), ended.stderr
+    assert ended.returncode == -signal.SIGINT
