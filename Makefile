@@ -43,7 +43,7 @@ else
 endif
 
 bench: $(READY)
-	set -e; for name in hash_grid nnfm stage2_step render memory scaling effects profile torch_options; do \
+	set -e; for name in hash_grid nnfm stage2_step render memory scaling effects profile torch_options viewer; do \
 	    $(BIN)/python -m benchmarks.$$name $(BENCH); \
 	done; for peer in dense even vanilla-nerf; do \
 	    $(BIN)/python -m benchmarks.stage1 --peer $$peer $(BENCH); \

@@ -8,6 +8,7 @@ repetition, as the others have, and in the end the same ones once more, when all
 from dataclasses import dataclass
 from typing import Any, Dict, Tuple
 
+import torch
 import tyro
 from nerfstudio.cameras.camera_paths import get_interpolated_camera_path
 from nerfstudio.cameras.cameras import Cameras
@@ -16,6 +17,7 @@ from torch import Tensor
 from benchmarks._measure import Measure, Options, Report, ratio_of_pairs, timed
 from benchmarks._scene import (
     PLAIN_NOTE,
+    Scene,
     find_or_train_coarse,
     find_scene,
     plain_field_of,
@@ -25,6 +27,7 @@ from sparsestyle_ns.errors import exit_on_input_error
 from sparsestyle_ns.evaluation.image_metrics import psnr
 from sparsestyle_ns.evaluation.training import Training
 from sparsestyle_ns.models.hier_style import RenderMode
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
 
 SIDE = 252
 FRAMES_BETWEEN_VIEWS = 10
@@ -40,23 +43,33 @@ class RenderOptions(Options):
     """Iterations of the stylised run; it need not be finished, only be no coarse field any more."""
 
 
+def stylise(options: RenderOptions, scene: Scene, device: torch.device) -> Tuple[HierStylePipeline, Dict[str, Any]]:
+    """A pipeline that has been stylised for a few iterations, and its settings for the record."""
+    coarse = find_or_train_coarse(scene, options)
+    config = style_config(scene, coarse, SIDE, options)
+    config.pipeline.warm_start_steps = min(config.pipeline.warm_start_steps, options.style_iterations)
+    training = Training(config, device, coarse.model_state())
+    iterations = 1 if options.quick else options.style_iterations
+    for _ in range(iterations):
+        training.step()
+    training.pipeline.eval()
+    settings = {
+        "style_iterations": iterations,
+        "coarse_iterations": coarse.config.max_num_iterations,
+        "bake_resolution": config.pipeline.model.bake_resolution,
+    }
+    return training.pipeline, settings
+
+
 @exit_on_input_error
 def main(options: RenderOptions) -> None:
     """Stylises for a few iterations, then measures all three."""
     report = Report("render", options)
     scene = find_scene(options)
-    coarse = find_or_train_coarse(scene, options)
-    config = style_config(scene, coarse, SIDE, options)
-    config.pipeline.warm_start_steps = min(config.pipeline.warm_start_steps, options.style_iterations)
-    training = Training(config, report.device, coarse.model_state())
-    iterations = 1 if options.quick else options.style_iterations
-    for _ in range(iterations):
-        training.step()
-    training.pipeline.eval()
-    model = training.pipeline.model
-    views = training.pipeline.datamanager.eval_dataset.cameras
+    pipeline, settings = stylise(options, scene, report.device)
+    model, views = pipeline.model, pipeline.datamanager.eval_dataset.cameras
     plain = plain_field_of(model)
-    del training
+    del pipeline
     flight = get_interpolated_camera_path(views, FRAMES_BETWEEN_VIEWS, order_poses=False).to(report.device)
     pictures: Dict[Any, Tensor] = {}
 
@@ -89,12 +102,7 @@ def main(options: RenderOptions) -> None:
     }
 
     height, width, _ = pictures["exact", 0].shape
-    report.extra["settings"] = {
-        "size": [width, height],
-        "style_iterations": iterations,
-        "coarse_iterations": coarse.config.max_num_iterations,
-        "bake_resolution": model.config.bake_resolution,
-    }
+    report.extra["settings"] = {"size": [width, height], **settings}
     report.extra["psnr_to_exact"] = likeness
     report.extra["first_baked_picture_seconds"] = first
     report.notes.append(PLAIN_NOTE + " Here it runs without gradients.")
