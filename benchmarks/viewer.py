@@ -10,7 +10,7 @@ import tempfile
 import threading
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Callable, Dict, List, Tuple
+from typing import Any, Callable, Dict, List, Optional, Tuple
 
 import torch
 import tyro
@@ -34,7 +34,7 @@ FRAMES = 8
 
 
 class Screen(RenderStateMachine):
-    """What nerfstudio has for each browser; draws when it is asked to, and not by itself.
+    """What nerfstudio has for each browser, a thread; draws as it is told, and nothing by itself.
 
     Args:
         pipeline: what to look at.
@@ -51,6 +51,23 @@ class Screen(RenderStateMachine):
         viewer.control_panel._max_res.value = side
         super().__init__(viewer, 10.0, SimpleNamespace(camera=SimpleNamespace(aspect=self.aspect)))
         self.state = "high"
+        self._tour: Callable[[], None] = lambda: None
+        self._error: Optional[BaseException] = None
+
+    def guide(self, tour: Callable[[], None]) -> None:
+        """Does something on the screen's own thread, the only kind that the panel's controls hold for."""
+        self._tour = tour
+        self.start()
+        self.join()
+        if self._error is not None:
+            raise self._error
+
+    def run(self) -> None:
+        """See `guide`."""
+        try:
+            self._tour()
+        except BaseException as error:
+            self._error = error
 
     def draw(self, camera_to_world: Tensor) -> Dict[str, Tensor]:
         """The viewer's picture from a camera."""
@@ -70,9 +87,10 @@ def flight_between(pipeline: HierStylePipeline, frames: int) -> List[Tensor]:
 def main(options: RenderOptions) -> None:
     """Stylises for a few iterations, opens the viewer, and looks around."""
     report = Report("viewer", options)
+    side = SIDE // 8 if options.quick else SIDE
     pipeline, settings = stylise(options, find_scene(options), report.device)
     with tempfile.TemporaryDirectory() as folder:
-        screen = Screen(pipeline, Path(folder), SIDE // 8 if options.quick else SIDE)
+        screen = Screen(pipeline, Path(folder), side)
         panel = pipeline.panel
         if panel.baker is not None:  # it would fill new ground before it is looked at
             panel.baker.ending.set()
@@ -93,30 +111,32 @@ def main(options: RenderOptions) -> None:
         def at_rest(number: int) -> int:
             return 1
 
-        panel.mode.value = "baked"
-        screen.draw(flight[0])
-        look("baked, new ground", onward)
-        look("baked, known ground", onward)
-        look("baked, strength moved", at_rest, panel.strength)
-        panel.strength.value = 1.0
-        look("baked, geometry moved", at_rest, panel.geometry)
-        panel.geometry.value = 1.0
-        other = copy.deepcopy(pipeline.model.residual)
-        with torch.no_grad():
-            other.color_head.weight.neg_()
-        panel.styles.append(Style("other", other))
-        panel._offer_styles(panel.styles[0].name)
-        panel.other.value = "other"
-        screen.draw(flight[1])
-        look("baked, two styles blended", at_rest, panel.blend)
-        panel.other.value, panel.mode.value = NO_BLEND, "exact"
-        look("exact", onward)
-        height, width = screen.draw(flight[1])["rgb"].shape[:2]
+        def tour() -> None:
+            panel.mode.value = "baked"
+            screen.draw(flight[0])
+            look("baked, new ground", onward)
+            look("baked, known ground", onward)
+            look("baked, strength moved", at_rest, panel.strength)
+            panel.strength.value = 1.0
+            look("baked, geometry moved", at_rest, panel.geometry)
+            panel.geometry.value = 1.0
+            other = copy.deepcopy(pipeline.model.residual)
+            with torch.no_grad():
+                other.color_head.weight.neg_()
+            panel.styles.append(Style("other", other))
+            panel._offer_styles(panel.styles[0].name)
+            panel.other.value = "other"
+            screen.draw(flight[1])
+            look("baked, two styles blended", at_rest, panel.blend)
+            panel.other.value, panel.mode.value = NO_BLEND, "exact"
+            look("exact", onward)
+
+        screen.guide(tour)
         panel.close()
     rates = {part: 1.0 / statistics.median(found[part]["seconds"]) for part, found in report.repetitions.items()}
     for part, rate in rates.items():
         print(f"  {part}: {rate:.1f} a second")
-    report.extra["settings"] = {"size": [width, height], **settings}
+    report.extra["settings"] = {"longer_side": side, **settings}
     report.extra["pictures_per_second"] = rates
     report.write()
 
