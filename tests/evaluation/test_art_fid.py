@@ -227,4 +227,9 @@ def test_rows_of_a_study_are_measured_again_once_there_are_weights(
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     assert known({"style_loss": 0.1}) and known({"style_loss": 0.1, "art_fid": 2.0})
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(torch_home))
-    assert not known({"style_loss": 0.1}) and known({"style_loss": 0.1, "art_fid": 2.0})
+    both = {"art_fid": 2.0, "short_lpips": 0.1}
+    assert known({"style_loss": 0.1, **both})
+    for missing in ((), ("art_fid",), ("short_lpips",)):
+        figures = {key: value for key, value in both.items() if key not in missing}
+        assert known(figures) == (not missing)
+    assert not known({"style_loss": 0.1})
