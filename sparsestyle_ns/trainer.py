@@ -423,6 +423,8 @@ class HierStyleTrainer(SparseStyleTrainer):
     """The trainer of stage 2: finds or trains the coarse run first."""
 
     stage = "Stage 2"
+    _first_backbone: Optional[Dict[str, Any]] = None
+    """The feature network's note in the checkpoint that is gone on with."""
 
     @exit_on_input_error
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
@@ -471,9 +473,12 @@ class HierStyleTrainer(SparseStyleTrainer):
     def notes(self) -> Dict[str, Any]:
         """Which feature network stylised the scene, where its weights came from, and which coarse run it builds on."""
         pipeline = self.config.pipeline
+        backbone = asdict(self.pipeline.targets.backbone.description)
+        if self._first_backbone is not None and self._first_backbone["sha256"] == backbone["sha256"]:
+            backbone = self._first_backbone  # how it was found when the run began
         return {
             **super().notes(),
-            "backbone": asdict(self.pipeline.targets.backbone.description),
+            "backbone": backbone,
             "coarse_run": str(pipeline.coarse_run),
             "coarse_field": asdict(pipeline.model.coarse_field),
             "fine_encoding": pipeline.model.fine_encoding,
@@ -496,6 +501,7 @@ class HierStyleTrainer(SparseStyleTrainer):
         pipeline.coarse_run = Path(state["coarse_run"])
         if pipeline.model.fine_encoding == "auto":
             pipeline.model.fine_encoding = state.get("fine_encoding", "hash")
+        self._first_backbone = state["backbone"]
         if pipeline.backbone == "auto" and pipeline.vgg_weights is None:
             pipeline.backbone = state["backbone"]["name"]
 

@@ -6,6 +6,7 @@ Every public function of those packages has a property here, or is named with th
 
 import importlib
 import inspect
+import itertools
 import math
 import pkgutil
 
@@ -25,7 +26,13 @@ import sparsestyle_ns.rendering
 import sparsestyle_ns.style
 from sparsestyle_ns import schedules
 from sparsestyle_ns.effects.layouts import BoundedBox, Contraction, ForwardFacing
-from sparsestyle_ns.field_components import hash_grid, hash_grid_kernels, positional_encoding, thinned_mlp
+from sparsestyle_ns.field_components import (
+    hash_grid,
+    hash_grid_kernels,
+    positional_encoding,
+    thinned_mlp,
+    tiny_cuda_grid,
+)
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.losses import content, geometry, nnfm, reconstruction, semantic
@@ -54,6 +61,7 @@ ELSEWHERE = {
     "sparsestyle_ns.field_components.hash_grid_triton": "needs CUDA or Triton's interpreter: test_hash_grid.py",
     "sparsestyle_ns.rendering.baked_kernels.march_rays": "is what march_compiled calls",
     "sparsestyle_ns.style.vgg.available_backbone": "takes no input: test_studies.py",
+    "sparsestyle_ns.field_components.tiny_cuda_grid.has_tiny_cuda_nn": "asks what is installed: test_hier_style.py",
     "sparsestyle_ns.rendering.baked.march_compiled": "is what render_baked calls on a CPU",
 }
 """Modules and functions without a property of their own, and why."""
@@ -466,6 +474,23 @@ def test_a_thinned_backward_pass_weights_points_up_and_stays_finite(data, count,
     torch.testing.assert_close(output, head(torch.relu(layer(inputs))))
     (output.clamp(-1e3, 1e3).sum() * 1e-3).backward()
     assert all(torch.isfinite(parameter.grad).all() for parameter in (*layer.parameters(), *head.parameters()))
+
+
+@covers(tiny_cuda_grid.growth_factor, tiny_cuda_grid.tiny_cuda_levels, tiny_cuda_grid.locate_tiny_cuda_corners)
+@given(SEEDS, st.integers(1, 9), st.integers(1, 300), st.integers(1, 300), st.integers(3, 19))
+def test_points_of_tiny_cuda_nns_grids_lie_in_their_levels_rows(seed, num_levels, first, second, log2_table_size):
+    levels = tiny_cuda_grid.tiny_cuda_levels(num_levels, min(first, second), max(first, second), log2_table_size)
+    assert len(levels) == num_levels
+    assert all(level.first_row + level.num_rows == after.first_row for level, after in itertools.pairwise(levels))
+    assert all(8 <= level.num_rows <= 2**log2_table_size and level.num_rows % 8 == 0 for level in levels)
+    torch.manual_seed(seed)
+    points = torch.cat([torch.rand(20, 3), torch.randint(0, 2, (4, 3)).float()])
+    corners = tiny_cuda_grid.locate_tiny_cuda_corners(points, levels)
+    starts = torch.tensor([level.first_row for level in levels])[:, None]
+    ends = starts + torch.tensor([level.num_rows for level in levels])[:, None]
+    assert ((corners.rows >= starts) & (corners.rows < ends)).all()
+    assert (corners.weights >= 0).all()
+    torch.testing.assert_close(corners.weights.sum(dim=-1), torch.ones(24, num_levels))
 
 
 @covers(hash_grid.grid_resolutions)
