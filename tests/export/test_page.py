@@ -113,13 +113,18 @@ def test_dragging_turns_the_camera_as_the_orbit_says(tab, tmp_path, kind):
     assert psnr(shown(tab), expected) > 45
 
 
-@needs_chromium
-def test_the_wheel_comes_nearer_keys_turn_and_the_button_goes_back_to_the_photos(tab, tmp_path):
-    path = tmp_path / "page.html"
+def opened(tab, folder):
+    """The picture that the page of a scene in a box opens with."""
+    path = folder / "page.html"
     path.write_bytes(page_of("box"))
     tab.open(f"{path.as_uri()}#size={WIDTH}x{HEIGHT}")
     tab.wait_for(READY)
-    opening = shown(tab)
+    return shown(tab)
+
+
+@needs_chromium
+def test_the_wheel_comes_nearer_keys_turn_and_the_button_goes_back_to_the_photos(tab, tmp_path):
+    opening = opened(tab, tmp_path)
     background = torch.tensor([1.0, 0.9, 0.8])
 
     def covered(picture):
@@ -140,11 +145,7 @@ def test_the_wheel_comes_nearer_keys_turn_and_the_button_goes_back_to_the_photos
 
 @needs_chromium
 def test_a_fine_picture_that_is_asked_for_while_a_coarse_one_is_due_is_drawn(tab, tmp_path):
-    path = tmp_path / "page.html"
-    path.write_bytes(page_of("box"))
-    tab.open(f"{path.as_uri()}#size={WIDTH}x{HEIGHT}")
-    tab.wait_for(READY)
-    opening = shown(tab)
+    opening = opened(tab, tmp_path)
     # Both before the next frame, which a callback that is asked for after them comes at the end of.
     state = tab.evaluate(
         """new Promise((done) => {
