@@ -16,9 +16,9 @@ from typing import Any, Callable, Dict, List, Literal, Optional, Sequence, Tuple
 import torch
 from torch import Tensor
 
-from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.evaluation.machine import OtherLoad, device_name, synchronize, versions
-from sparsestyle_ns.files import write_whole
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import write_whole
+from sparsestyle_ns.utils.machine import OtherLoad, device_name, synchronize, versions
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"

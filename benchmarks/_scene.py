@@ -21,24 +21,24 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from benchmarks._measure import CACHE, ROOT, Options
-from sparsestyle_ns.coarse_run import CoarseRun, find_coarse_run
-from sparsestyle_ns.datamanager import FewShotDataManager
-from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
-from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.evaluation.training import Training
+from sparsestyle_ns.core.occupancy import interval_lengths
+from sparsestyle_ns.core.sampling import even_edges
+from sparsestyle_ns.core.schedules import content_weight
+from sparsestyle_ns.core.spaces import Space
+from sparsestyle_ns.core.volrend import dense_weights, optical_depth
+from sparsestyle_ns.data.llff import LLFFDataParserConfig
+from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField, fine_density
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.models.hier_style import HierStyleModel
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
-from sparsestyle_ns.rendering.compositing import dense_weights, optical_depth
-from sparsestyle_ns.rendering.density_grid import interval_lengths
-from sparsestyle_ns.rendering.sampling import even_edges
-from sparsestyle_ns.rendering.space import Space
-from sparsestyle_ns.rendering.volume import over_background
-from sparsestyle_ns.scene_record import record_scene
-from sparsestyle_ns.schedules import content_weight
+from sparsestyle_ns.rendering.render import over_background
+from sparsestyle_ns.runs.coarse_run import CoarseRun, find_coarse_run
+from sparsestyle_ns.runs.scene_record import record_scene
+from sparsestyle_ns.utils.errors import InputError
 
 BACKBONE = "vgg16-shift-tolerant"
 """The feature network of all benchmarks: its weights are on every machine, so that figures can be compared."""

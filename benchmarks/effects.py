@@ -22,13 +22,13 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 
 from benchmarks._measure import CACHE, ROOT, Measure, Options, Report, device_name, ratio_of_pairs, timed
 from benchmarks._scene import COARSE_METHOD
-from sparsestyle_ns.datamanager import FewShotDataManager, gather_pixels
-from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
+from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.registry import EFFECTS, EffectSettings
-from sparsestyle_ns.errors import InputError, exit_on_input_error
-from sparsestyle_ns.evaluation.training import Training
+from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, gather_pixels
 from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
+from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 
 PARSERS: Dict[str, Callable[[], DataParserConfig]] = {
     "llff": LLFFDataParserConfig,

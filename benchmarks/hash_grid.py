@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from benchmarks._measure import Options, Report, check_equal, ratio_of_pairs, timed
 from benchmarks._scene import hash_encoding_like
-from sparsestyle_ns.errors import exit_on_input_error
 from sparsestyle_ns.field_components.hash_grid import HashGrid
+from sparsestyle_ns.utils.errors import exit_on_input_error
 
 POINTS = 65_536
 FORWARD_TARGET, BACKWARD_TARGET = 5.0, 3.0

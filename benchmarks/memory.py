@@ -8,10 +8,10 @@ import tyro
 
 from benchmarks._measure import Options, Ratio, Report, in_fresh_process
 from benchmarks._scene import Scene, find_or_train_coarse, find_scene, style_config
-from sparsestyle_ns.coarse_run import read_coarse_run
-from sparsestyle_ns.errors import exit_on_input_error
-from sparsestyle_ns.evaluation.machine import peak_bytes
-from sparsestyle_ns.evaluation.training import Training
+from sparsestyle_ns.engine.training import Training
+from sparsestyle_ns.runs.coarse_run import read_coarse_run
+from sparsestyle_ns.utils.errors import exit_on_input_error
+from sparsestyle_ns.utils.machine import peak_bytes
 
 SIDES = (1008, 252)
 LIMIT = 8_000_000_000

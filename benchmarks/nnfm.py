@@ -13,13 +13,13 @@ from torch import Tensor
 
 from benchmarks._measure import Options, Report, check_equal, in_fresh_process, ratio_of_pairs, timed
 from benchmarks._scene import BACKBONE, find_scene, load_photos
-from sparsestyle_ns.errors import exit_on_input_error
-from sparsestyle_ns.evaluation.machine import peak_bytes
 from sparsestyle_ns.losses.content import content_loss
 from sparsestyle_ns.losses.nnfm import StyleIndex, nnfm_loss
-from sparsestyle_ns.style.image import load_style_image
-from sparsestyle_ns.style.targets import feature_rows, fit_side
+from sparsestyle_ns.losses.stylization import feature_rows, fit_side
+from sparsestyle_ns.style.painting import load_style_image
 from sparsestyle_ns.style.vgg import load_backbone
+from sparsestyle_ns.utils.errors import exit_on_input_error
+from sparsestyle_ns.utils.machine import peak_bytes
 
 PHOTO_SIDE, STYLE_SIDE = 504, 1000
 TARGET = 2.0

@@ -10,9 +10,9 @@ from torch.profiler import ProfilerActivity, profile
 
 from benchmarks._measure import Options, Report
 from benchmarks._scene import COARSE_METHOD, at_size, find_or_train_coarse, find_scene, style_config
-from sparsestyle_ns.errors import exit_on_input_error
-from sparsestyle_ns.evaluation.training import Training
+from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.utils.errors import exit_on_input_error
 
 STAGE_1_SIDE, STAGE_2_SIDE = 126, 252
 PARTS: Tuple[Tuple[str, str], ...] = (

@@ -23,11 +23,11 @@ from benchmarks._scene import (
     plain_field_of,
     style_config,
 )
-from sparsestyle_ns.errors import exit_on_input_error
-from sparsestyle_ns.evaluation.image_metrics import psnr
-from sparsestyle_ns.evaluation.training import Training
+from sparsestyle_ns.engine.training import Training
+from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.models.hier_style import RenderMode
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
+from sparsestyle_ns.utils.errors import exit_on_input_error
 
 SIDE = 252
 FRAMES_BETWEEN_VIEWS = 10

@@ -9,9 +9,9 @@ import tyro
 
 from benchmarks._measure import Options, Report, alternate, timed
 from benchmarks._scene import find_or_train_coarse, find_scene, style_config
-from sparsestyle_ns.coarse_run import CoarseRun
-from sparsestyle_ns.errors import exit_on_input_error
-from sparsestyle_ns.evaluation.training import Training
+from sparsestyle_ns.engine.training import Training
+from sparsestyle_ns.runs.coarse_run import CoarseRun
+from sparsestyle_ns.utils.errors import exit_on_input_error
 
 SIDE = 126
 COSTS = {

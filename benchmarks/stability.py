@@ -13,10 +13,10 @@ import tyro
 
 from benchmarks._measure import Options, Report
 from benchmarks._scene import BACKBONE, at_size, find_or_train_coarse, find_scene
-from sparsestyle_ns.coarse_run import CoarseRun
-from sparsestyle_ns.errors import InputError, exit_on_input_error
-from sparsestyle_ns.evaluation.training import Training
+from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.runs.coarse_run import CoarseRun
+from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 
 WORSE = 1.5
 """Times the default's loss that still counts as trained."""

@@ -19,10 +19,10 @@ from nerfstudio.engine.trainer import TrainerConfig
 from benchmarks._measure import Duration, Measure, Options, Report, ratio_of_pairs, timed
 from benchmarks._scene import COARSE_METHOD, Scene, at_size, find_scene, load_photos
 from sparsestyle_ns.effects.registry import EffectSettings
-from sparsestyle_ns.errors import InputError, exit_on_input_error
-from sparsestyle_ns.evaluation.image_metrics import psnr
-from sparsestyle_ns.evaluation.training import Training
+from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.metrics.image import psnr
+from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 
 SIDE = 126
 EVEN_SAMPLES = 64

@@ -10,8 +10,8 @@ from benchmarks._scene import (
     find_scene,
     style_config,
 )
-from sparsestyle_ns.errors import exit_on_input_error
-from sparsestyle_ns.evaluation.training import Training
+from sparsestyle_ns.engine.training import Training
+from sparsestyle_ns.utils.errors import exit_on_input_error
 
 SIDE = 252
 TARGET = 10.0

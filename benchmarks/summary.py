@@ -7,7 +7,7 @@ from typing import Any, Dict, List
 import tyro
 
 from benchmarks._measure import Options, write_json
-from sparsestyle_ns.errors import InputError, exit_on_input_error
+from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 
 BENCHMARKS = (
     "stage1_vanilla_nerf",

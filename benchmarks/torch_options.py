@@ -18,14 +18,14 @@ from torch.backends import cudnn
 from benchmarks._measure import Duration, Measure, Options, Report, ratio_of_pairs, timed
 from benchmarks._scene import BACKBONE
 from benchmarks.nnfm import features_of_scene
-from sparsestyle_ns.errors import exit_on_input_error
+from sparsestyle_ns.core.precision import Precision, autocast
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.losses.nnfm import CHUNK_SIZE, StyleIndex
-from sparsestyle_ns.rendering.precision import Precision, autocast
-from sparsestyle_ns.style.targets import feature_rows
+from sparsestyle_ns.losses.stylization import feature_rows
 from sparsestyle_ns.style.vgg import VGGFeatures, load_backbone
+from sparsestyle_ns.utils.errors import exit_on_input_error
 
 USUAL, EXACT = "as it is", "float32"
 Work = Callable[[], Tensor]

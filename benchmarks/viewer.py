@@ -25,8 +25,8 @@ from torch import Tensor
 from benchmarks._measure import Report, timed
 from benchmarks._scene import find_scene
 from benchmarks.render import SIDE, RenderOptions, stylise
-from sparsestyle_ns.errors import exit_on_input_error
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
+from sparsestyle_ns.utils.errors import exit_on_input_error
 from sparsestyle_ns.viewer.panel import NO_BLEND
 from sparsestyle_ns.viewer.styles import Style
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Callable, Dict, List, Literal, Optional, Sequ
 
 import tyro
 
-from sparsestyle_ns.errors import InputError, exit_on_input_error
+from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 
 
 @exit_on_input_error
@@ -41,8 +41,8 @@ def gallery(
         evaluate: Measure runs that have no evaluation.json of their newest checkpoint, and leave them one.
     """
     from sparsestyle_ns.gallery.page import gallery_page, read_film
-    from sparsestyle_ns.page import prepare_page, write_page
-    from sparsestyle_ns.run_folder import STYLE_METHOD, find_config
+    from sparsestyle_ns.runs.run_folder import STYLE_METHOD, find_config
+    from sparsestyle_ns.utils.page import prepare_page, write_page
 
     if not runs:
         raise InputError("There is no run to show; name at least one run's folder.")
@@ -54,9 +54,9 @@ def gallery(
     for path in video:
         read_film(path)
     prepare_page(output_path)  # rendering takes minutes, so what can fail without it fails before
+    from sparsestyle_ns.engine.hints import finish
     from sparsestyle_ns.gallery.collect import collect_run
-    from sparsestyle_ns.next_command import finish
-    from sparsestyle_ns.progress import say
+    from sparsestyle_ns.utils.progress import say
 
     videos = [*video, *[None] * (len(runs) - len(video))]
     pictures = []
@@ -88,8 +88,8 @@ def evaluate(
         style_image: Painting to measure a stylised run against, if not the one it was made with; needs --output-path.
         baked: Also measure how close a stylised run's baked renders are to exact ones (PSNR in dB).
     """
-    from sparsestyle_ns.output_file import prepare_output
-    from sparsestyle_ns.run_folder import REPORT_FILE, STYLE_METHOD, find_config
+    from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config
+    from sparsestyle_ns.utils.output_file import prepare_output
 
     needs_style = baked or style_image is not None
     config = find_config(run, STYLE_METHOD if needs_style else "")
@@ -98,12 +98,12 @@ def evaluate(
     path = output_path or config.parent / REPORT_FILE
     prepare_output(path, "The report", "report.json")  # measuring takes minutes, so what can fail fails before
     if style_image is not None:
-        from sparsestyle_ns.style.image import load_style_image
+        from sparsestyle_ns.style.painting import load_style_image
 
         load_style_image(style_image)
+    from sparsestyle_ns.engine.hints import after_evaluation, finish
     from sparsestyle_ns.evaluation.held_out import evaluate_run
     from sparsestyle_ns.evaluation.tables import report_tables
-    from sparsestyle_ns.next_command import after_evaluation, finish
 
     report = evaluate_run(config, path, style_image, baked)
     for table in report_tables(report.means, len(report.views)):
@@ -134,8 +134,8 @@ def effects(
     """
     from contextlib import redirect_stdout
 
-    from sparsestyle_ns.effects.command import measure_scene
-    from sparsestyle_ns.next_command import after_effects, finish
+    from sparsestyle_ns.engine.hints import after_effects, finish
+    from sparsestyle_ns.prepare.measure_effects import measure_scene
 
     with redirect_stdout(sys.stderr):  # what dataparsers have to say must not get into the JSON
         decisions = measure_scene(dataparser, data, num_views, view_ids, coarse_run, style_image)
@@ -184,8 +184,8 @@ def tradeoff(
         vgg_weights: File with the weights of VGG-16, as for ns-train.
         backbone: Feature network, as for ns-train.
     """
-    from sparsestyle_ns.evaluation.tradeoff import command
-    from sparsestyle_ns.evaluation.tradeoff.budget import parse_duration
+    from sparsestyle_ns.studies.tradeoff import command
+    from sparsestyle_ns.studies.tradeoff.budget import parse_duration
 
     seconds = parse_duration(budget)
     if rounds < 1:
@@ -249,8 +249,8 @@ def compare(options: Annotated[StudyOptions, tyro.conf.arg(name="")]) -> None:
     the optical flow, fine-tuning the coarse field (ARF's kind), a FreeNeRF-style field fine-tuned, and ours.
     Interrupted, the same command goes on where it was.
     """
-    from sparsestyle_ns.evaluation.comparison import compare as run
-    from sparsestyle_ns.next_command import study_arguments
+    from sparsestyle_ns.engine.hints import study_arguments
+    from sparsestyle_ns.studies.comparison import compare as run
 
     _write_study(options, run, "Comparison", lambda given, _: ["sparsestyle", "ablate", *study_arguments(given)])
 
@@ -264,7 +264,7 @@ def ablate(options: Annotated[StudyOptions, tyro.conf.arg(name="")]) -> None:
     without residual density, with constant content weights.
     Interrupted, the same command goes on where it was; runs that `compare` has made are used.
     """
-    from sparsestyle_ns.evaluation.ablations import ablate as run
+    from sparsestyle_ns.studies.ablations import ablate as run
 
     _write_study(options, run, "Ablations", lambda _, stylised: ["sparsestyle", "gallery", *stylised])
 
@@ -280,13 +280,13 @@ def _write_study(
     Args:
         next_command: what to type next, from the options and the folders of our own stylised runs.
     """
-    from sparsestyle_ns.dataparsers.choice import check_parser
-    from sparsestyle_ns.evaluation.experiments import Laboratory, SceneSettings
-    from sparsestyle_ns.evaluation.study import Study
-    from sparsestyle_ns.evaluation.study_page import write_study
-    from sparsestyle_ns.next_command import finish
-    from sparsestyle_ns.page import prepare_page
-    from sparsestyle_ns.style.image import load_style_image
+    from sparsestyle_ns.data.parser_choice import check_parser
+    from sparsestyle_ns.engine.hints import finish
+    from sparsestyle_ns.studies.experiments import Laboratory, SceneSettings
+    from sparsestyle_ns.studies.study import Study
+    from sparsestyle_ns.studies.study_page import write_study
+    from sparsestyle_ns.style.painting import load_style_image
+    from sparsestyle_ns.utils.page import prepare_page
 
     check_parser(options.parser)
     if not options.data.exists():
@@ -341,8 +341,8 @@ def export(
         resolution: html: cells along a side of the scene's cube. 255 fits into the graphics memory that every browser
             with WebGL2 promises.
     """
-    from sparsestyle_ns.output_file import prepare_output
-    from sparsestyle_ns.run_folder import STYLE_METHOD, find_config
+    from sparsestyle_ns.runs.run_folder import STYLE_METHOD, find_config
+    from sparsestyle_ns.utils.output_file import prepare_output
 
     if not 32 <= resolution <= 1023:
         raise InputError(f"--resolution {resolution} isn't between 32 and 1023; 255 suits most scenes.")
@@ -351,8 +351,8 @@ def export(
     prepare_output(
         output_path, "The scene", example
     )  # rendering takes minutes, so what can fail without it fails before
+    from sparsestyle_ns.engine.hints import after_export, finish
     from sparsestyle_ns.export.command import export_mesh, export_page, export_points, load_scene
-    from sparsestyle_ns.next_command import after_export, finish
 
     scene = load_scene(config)
     if format == "html":
@@ -387,7 +387,7 @@ def prepare(
     from sparsestyle_ns.prepare.command import prepare_scene
 
     scene = prepare_scene(photos, output, poses)
-    from sparsestyle_ns.next_command import finish
+    from sparsestyle_ns.engine.hints import finish
 
     made = f"{scene.folder}, {len(scene.names)} photos with poses"
     finish(made, ["ns-train", "coarse-fewshot", "--data", scene.folder, scene.parser])

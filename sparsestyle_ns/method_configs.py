@@ -5,18 +5,18 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig, MultiS
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from sparsestyle_ns.datamanager import FewShotDataManagerConfig
-from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
-from sparsestyle_ns.models.hier_style import HierStyleModelConfig
-from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
-from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
-from sparsestyle_ns.trainer import (
+from sparsestyle_ns.engine.trainer import (
     CoarseFewShotTrainer,
     FusedAdamConfig,
     HierStyleTrainer,
     HierStyleTrainerConfig,
     SparseStyleTrainerConfig,
 )
+from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
+from sparsestyle_ns.models.hier_style import HierStyleModelConfig
+from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
+from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 
 
 def _logging(steps_per_log: int) -> LoggingConfig:

@@ -16,8 +16,8 @@ from conftest import TINY, TINY_STYLE, ns_train
 from nerfstudio.configs.dataparser_configs import all_dataparsers
 from PIL import Image
 
-from sparsestyle_ns.datamanager import FewShotDataManagerConfig
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
+from sparsestyle_ns.utils.errors import InputError
 
 
 def refusal(method: str, scene: Path, outputs: Path, *flags: str) -> str:

@@ -15,16 +15,16 @@ from nerfstudio.data.scene_box import SceneBox
 
 from benchmarks import _measure, _scene, effects, nnfm, profile, stability, stage1, summary, torch_options
 from benchmarks._measure import Duration, Options, Ratio, Report
-from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.evaluation import machine
+from sparsestyle_ns.core.occupancy import Occupancy
+from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.losses.nnfm import nnfm_loss
 from sparsestyle_ns.method_configs import method_config
-from sparsestyle_ns.rendering.density_grid import Occupancy
-from sparsestyle_ns.rendering.space import BoxSpace, ContractedSpace
-from sparsestyle_ns.rendering.volume import freeze_samples, render_stylised
+from sparsestyle_ns.rendering.render import freeze_samples, render_stylised
+from sparsestyle_ns.utils import machine
+from sparsestyle_ns.utils.errors import InputError
 
 CPU = torch.device("cpu")
 AMPLE = Ratio(12.5, (10.0, 15.0))

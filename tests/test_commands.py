@@ -23,10 +23,10 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.trainer import Trainer
 from scipy.spatial.transform import Rotation
 
-from sparsestyle_ns.coarse_run import newest_checkpoint, read_coarse_run
-from sparsestyle_ns.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.effects.registry import EFFECTS
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
+from sparsestyle_ns.runs.coarse_run import newest_checkpoint, read_coarse_run
 from sparsestyle_ns.style import vgg
 
 METHODS = ("coarse-fewshot", "coarse-fewshot-draft", "hier-style", "hier-style-draft")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Dict, List, Literal, Optional, Tuple
 
 from sparsestyle_ns.effects.scene import Scene
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.utils.errors import InputError
 
 EffectChoice = Literal["auto", "on", "off"]
 Source = Literal["photos", "coarse field", "style image"]

@@ -5,9 +5,9 @@ from typing import Any, Dict, List, Tuple
 import numpy as np
 from jaxtyping import Float
 
+from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace, Space
 from sparsestyle_ns.effects.base import Effect, Measurement
 from sparsestyle_ns.effects.scene import Scene
-from sparsestyle_ns.rendering.space import BoxSpace, ContractedSpace, ForwardFacingSpace, Space
 
 MAX_SPREAD = 45.0
 """Degrees by which a camera may look aside from the mean viewing direction of a forward-facing capture."""

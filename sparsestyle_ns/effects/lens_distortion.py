@@ -7,8 +7,8 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
+from sparsestyle_ns.data.matches import undistorted
 from sparsestyle_ns.effects.base import Effect, Measurement
-from sparsestyle_ns.effects.matches import undistorted
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_PIXELS = 0.25

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from sparsestyle_ns.data.matches import distances_along, why_unmatched
 from sparsestyle_ns.effects.base import Effect, Measurement
-from sparsestyle_ns.effects.matches import distances_along, why_unmatched
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_POINTS = 100

@@ -16,7 +16,7 @@ from sparsestyle_ns.effects.palette import Palette
 from sparsestyle_ns.effects.residual_density import ResidualDensity
 from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.effects.view_color import ViewColor
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.utils.errors import InputError
 
 EFFECTS: Dict[str, Effect] = {
     effect.name: effect

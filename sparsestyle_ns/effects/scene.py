@@ -16,9 +16,9 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from PIL import Image
 from torch import Tensor
 
-from sparsestyle_ns.effects.matches import PointMatches, match_points
-from sparsestyle_ns.photos import open_photo
-from sparsestyle_ns.view_selection import evenly_spaced
+from sparsestyle_ns.data.matches import PointMatches, match_points
+from sparsestyle_ns.data.photos import open_photo
+from sparsestyle_ns.data.view_selection import evenly_spaced
 
 LONGEST_SIDE = 504
 """Pixels along the longer side at which photos are looked at."""

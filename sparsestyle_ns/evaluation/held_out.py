@@ -12,23 +12,23 @@ from jaxtyping import Float
 from torch import Tensor
 from torchvision.utils import save_image
 
-from sparsestyle_ns.evaluation.art_fid import ArtFID
-from sparsestyle_ns.evaluation.camera_path import measuring_path
-from sparsestyle_ns.evaluation.image_metrics import image_metrics, psnr
+from sparsestyle_ns.core.camera_paths import measuring_path
+from sparsestyle_ns.core.occupancy import interval_lengths
+from sparsestyle_ns.core.precision import autocast
+from sparsestyle_ns.core.sampling import even_edges
+from sparsestyle_ns.core.volrend import dense_weights, effective_samples, optical_depth
 from sparsestyle_ns.evaluation.path_frames import render_path
-from sparsestyle_ns.evaluation.style_strength import gram_distance, gram_matrix
-from sparsestyle_ns.files import write_whole
+from sparsestyle_ns.losses.stylization import StyleTargets, covered_rows
+from sparsestyle_ns.metrics.art_fid import ArtFID
+from sparsestyle_ns.metrics.gram import gram_distance, gram_matrix
+from sparsestyle_ns.metrics.image import image_metrics, psnr
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
-from sparsestyle_ns.progress import track
-from sparsestyle_ns.rendering.compositing import dense_weights, effective_samples, optical_depth
-from sparsestyle_ns.rendering.density_grid import interval_lengths
-from sparsestyle_ns.rendering.precision import autocast
-from sparsestyle_ns.rendering.sampling import even_edges
-from sparsestyle_ns.run_folder import REPORT_FILE, load_run
-from sparsestyle_ns.style.targets import StyleTargets, covered_rows
+from sparsestyle_ns.runs.run_folder import REPORT_FILE, load_run
+from sparsestyle_ns.utils.files import write_whole
+from sparsestyle_ns.utils.progress import track
 
 EVEN_SAMPLES = 64
 """Even samples a ray on which `mean_effective_samples` counts: the number means something only with this one."""

@@ -8,10 +8,10 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sparsestyle_ns.evaluation.consistency import RANGES, PathGeometry
-from sparsestyle_ns.evaluation.warping import MIN_COVERAGE, Pinhole, Surface
+from sparsestyle_ns.metrics.consistency import RANGES, PathGeometry
+from sparsestyle_ns.metrics.warping import MIN_COVERAGE, Pinhole, Surface
 from sparsestyle_ns.models.hier_style import HierStyleModel
-from sparsestyle_ns.progress import track
+from sparsestyle_ns.utils.progress import track
 
 
 @dataclass

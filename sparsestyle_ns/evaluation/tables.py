@@ -7,8 +7,8 @@ from typing import Dict, List, Optional, Sequence, Tuple
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from sparsestyle_ns.evaluation.art_fid import why_left_out
-from sparsestyle_ns.page import table
+from sparsestyle_ns.metrics.art_fid import why_left_out
+from sparsestyle_ns.utils.page import table
 
 LABELS: Dict[str, Tuple[str, int]] = {
     "psnr": ("PSNR dB ↑", 2),

@@ -11,9 +11,7 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.held_out import exact_outputs
-from sparsestyle_ns.evaluation.image_metrics import psnr
 from sparsestyle_ns.export.orbit import make_orbit, most_central, pinholes, resized, survey
 from sparsestyle_ns.export.page import build_page, fit_page
 from sparsestyle_ns.export.points import (
@@ -28,10 +26,12 @@ from sparsestyle_ns.export.points import (
     without_background,
 )
 from sparsestyle_ns.export.voxels import Voxels, bake_voxels, render_voxels
+from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.models.hier_style import RAYS_PER_CALL, HierStyleModel
-from sparsestyle_ns.output_file import write_output
-from sparsestyle_ns.progress import track
-from sparsestyle_ns.run_folder import load_run
+from sparsestyle_ns.runs.run_folder import load_run
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.output_file import write_output
+from sparsestyle_ns.utils.progress import track
 
 COMPARED_SIDE = 252
 """Pixels along the longer side of the pictures by which an export is measured, at most."""

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.export.points import Points
+from sparsestyle_ns.utils.errors import InputError
 
 OCTREE_DEPTH = 9
 """Levels of the Poisson solver's octree, as in `ns-export poisson`."""

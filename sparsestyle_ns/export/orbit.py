@@ -13,7 +13,7 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
-from sparsestyle_ns.rendering.space import BoxSpace, ForwardFacingSpace, Space
+from sparsestyle_ns.core.spaces import BoxSpace, ForwardFacingSpace, Space
 
 STEEPEST = 85.0
 """Degrees above or below the horizon that a camera may look from."""

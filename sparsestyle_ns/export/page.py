@@ -21,12 +21,12 @@ from jaxtyping import Bool, UInt8
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace, Space
 from sparsestyle_ns.export.orbit import Orbit
 from sparsestyle_ns.export.voxels import EMPTY, ROUNDING, Voxels
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT
-from sparsestyle_ns.rendering.space import BoxSpace, ContractedSpace, ForwardFacingSpace, Space
+from sparsestyle_ns.utils.errors import InputError
 
 MAX_BYTES = 30_000_000
 """Size that a page may have: what goes through e-mail and opens on a telephone."""

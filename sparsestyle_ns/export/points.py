@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sparsestyle_ns.rendering.volume import straight_color
+from sparsestyle_ns.rendering.render import straight_color
 
 MIN_ACCUMULATION = 0.5
 """Rays with less weight than this see no surface."""

@@ -14,8 +14,9 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 from torch.nn import functional as F
 
+from sparsestyle_ns.core.occupancy import Occupancy, march
+from sparsestyle_ns.core.spaces import ForwardFacingSpace, Segments
 from sparsestyle_ns.models.hier_style import RAYS_PER_CALL, HierStyleModel
-from sparsestyle_ns.progress import track
 from sparsestyle_ns.rendering.baked import (
     DENSITY_STEP,
     DENSITY_UNIT,
@@ -26,10 +27,9 @@ from sparsestyle_ns.rendering.baked import (
     encode,
     render_baked,
 )
-from sparsestyle_ns.rendering.density_grid import Occupancy, march
 from sparsestyle_ns.rendering.mixing import Appearance, Mix, mixed
-from sparsestyle_ns.rendering.space import ForwardFacingSpace, Segments
-from sparsestyle_ns.rendering.volume import render_packed
+from sparsestyle_ns.rendering.render import render_packed
+from sparsestyle_ns.utils.progress import track
 
 EMPTY = 1
 """Code of density 0, as in baked rendering, where 0 stands for a value that isn't known."""

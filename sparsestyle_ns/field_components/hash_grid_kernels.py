@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestyle_ns.kernels import even_parts, kernel, run_on_threads
+from sparsestyle_ns.utils.numba_kernels import even_parts, kernel, run_on_threads
 
 _ONE = np.uint32(1)
 _PRIME_Y = np.uint32(2654435761)

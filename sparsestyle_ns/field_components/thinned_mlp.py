@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from sparsestyle_ns.rendering.precision import at_least_float32
+from sparsestyle_ns.core.precision import at_least_float32
 
 
 class Thinning(NamedTuple):

@@ -15,8 +15,8 @@ from nerfstudio.field_components import encodings
 from nerfstudio.field_components.encodings import FieldComponent, HashEncoding
 from torch import Tensor, nn
 
-from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.field_components.hash_grid import Corners, GridLocation, hash_corners, interpolate
+from sparsestyle_ns.utils.errors import InputError
 
 POSSIBLE_FEATURES = (1, 2, 4, 8)
 """Of a row, in the library."""

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from sparsestyle_ns.field_components.positional_encoding import PositionalEncoding
 from sparsestyle_ns.field_components.thinned_mlp import Thinning, thinned_mlp
-from sparsestyle_ns.fields.pieces import in_pieces
+from sparsestyle_ns.fields.chunked import in_chunks
 
 DensityActivation = Literal["softplus", "exp"]
 MAX_LOG_DENSITY = 15.0
@@ -87,7 +87,7 @@ class CoarseField(Field):
         """
         points = positions.reshape(-1, 3)
         if thinning is None:
-            density, feature = in_pieces(self._evaluate, points)
+            density, feature = in_chunks(self._evaluate, points)
         else:
             raw, feature = thinned_mlp(
                 self.position_encoding(points), self._hidden, (self.density_head, self.feature_head), thinning
@@ -112,7 +112,7 @@ class CoarseField(Field):
     ) -> Float[Tensor, "*batch 3"]:
         """c_c in [0, 1], from e_c and unit view directions."""
         batch = feature.shape[:-1]
-        (color,) = in_pieces(
+        (color,) = in_chunks(
             self._evaluate_color, feature.reshape(-1, self.feature_dim), directions.expand(*batch, 3).reshape(-1, 3)
         )
         return color.view(*batch, 3)

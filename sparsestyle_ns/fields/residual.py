@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from sparsestyle_ns.field_components.hash_grid import GridLocation
 from sparsestyle_ns.field_components.point_encodings import PointEncoding
-from sparsestyle_ns.fields.pieces import in_pieces
+from sparsestyle_ns.fields.chunked import in_chunks
 
 
 class _NonNegative(torch.autograd.Function):
@@ -87,7 +87,7 @@ class ResidualField(nn.Module):
         coarse_density: Float[Tensor, "points"],
     ) -> Tuple[Float[Tensor, "points"], Float[Tensor, "points 3"]]:
         """σ_f ≥ 0 (Eq. 3) and c_f in [0, 1] at located points, from e_c and σ_c there."""
-        return in_pieces(self._evaluate, self.grid.interpolate(location), feature, coarse_density)
+        return in_chunks(self._evaluate, self.grid.interpolate(location), feature, coarse_density)
 
     def _evaluate(self, encoded: Tensor, feature: Tensor, coarse_density: Tensor) -> Tuple[Tensor, Tensor]:
         hidden = self.mlp(torch.cat([encoded, feature], dim=-1))

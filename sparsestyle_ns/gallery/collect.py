@@ -8,17 +8,17 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.data.photos import PhotoDataset, at_size
+from sparsestyle_ns.data.view_selection import evenly_spaced
 from sparsestyle_ns.evaluation.held_out import SavedReport, evaluate_held_out, exact_outputs, saved_report
 from sparsestyle_ns.evaluation.tables import report_tables
 from sparsestyle_ns.gallery.film import as_pixels, make_film
 from sparsestyle_ns.gallery.page import Picture, RunPictures, View, read_film
-from sparsestyle_ns.page import Pixels
-from sparsestyle_ns.photos import PhotoDataset, at_size
-from sparsestyle_ns.progress import say, track
-from sparsestyle_ns.run_folder import REPORT_FILE, STYLE_METHOD, find_config, load_run
-from sparsestyle_ns.style.image import load_style_image
-from sparsestyle_ns.view_selection import evenly_spaced
+from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config, load_run
+from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.page import Pixels
+from sparsestyle_ns.utils.progress import say, track
 
 LONGEST_SIDE = 512
 """Pixels that a picture on the page has at most along its longer side."""

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 
-from sparsestyle_ns.evaluation.camera_path import look_one_way, showing_path
+from sparsestyle_ns.core.camera_paths import look_one_way, showing_path
 from sparsestyle_ns.gallery.page import Film
 from sparsestyle_ns.models.hier_style import HierStyleModel
-from sparsestyle_ns.page import Pixels
-from sparsestyle_ns.progress import track
+from sparsestyle_ns.utils.page import Pixels
+from sparsestyle_ns.utils.progress import track
 
 FRAMES_PER_SECOND = 16
 CONSTANT_RATE_FACTOR = 20

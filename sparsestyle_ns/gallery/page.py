@@ -11,10 +11,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Dict, List, Optional, Sequence, Tuple
 
-from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.tables import Table
-from sparsestyle_ns.names import free_name
-from sparsestyle_ns.page import Pixels, figure, image, picture_page, table
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.names import free_name
+from sparsestyle_ns.utils.page import Pixels, figure, image, picture_page, table
 
 THUMBNAIL_SIDE = 224
 """Pixels that a picture of the grid has at most along its longer side."""

@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestyle_ns.rendering.precision import at_least_float32
+from sparsestyle_ns.core.precision import at_least_float32
 
 
 def content_loss(features: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:

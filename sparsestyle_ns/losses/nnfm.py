@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sparsestyle_ns.rendering.precision import at_least_float32, without_autocast
+from sparsestyle_ns.core.precision import at_least_float32, without_autocast
 
 CHUNK_SIZE = 2048
 """Feature vectors compared at once; 2048 × 2048 similarities are 16 MiB in float32."""

@@ -3,7 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestyle_ns.rendering.precision import at_least_float32
+from sparsestyle_ns.core.precision import at_least_float32
 
 
 def reconstruction_loss(rendered: Float[Tensor, "*batch 3"], photo: Float[Tensor, "*batch 3"]) -> Float[Tensor, ""]:

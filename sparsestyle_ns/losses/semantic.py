@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestyle_ns.core.precision import at_least_float32
 from sparsestyle_ns.losses.nnfm import nnfm_loss
-from sparsestyle_ns.rendering.precision import at_least_float32
 
 
 def pooled_features(features: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C"]:

@@ -10,22 +10,22 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
+from sparsestyle_ns.core.occupancy import DensityGrid
+from sparsestyle_ns.core.precision import Precision, autocast
+from sparsestyle_ns.core.sampling import even_edges
+from sparsestyle_ns.core.schedules import ramp
+from sparsestyle_ns.core.spaces import Segments
+from sparsestyle_ns.core.volrend import distortion, effective_samples
 from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.field_components.positional_encoding import revealed_levels
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
 from sparsestyle_ns.fields.coarse import CoarseField, DensityActivation
 from sparsestyle_ns.losses.geometry import matched_depth_loss, near_density
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
-from sparsestyle_ns.processes import num_processes, own_share, put_together
-from sparsestyle_ns.rendering.compositing import distortion, effective_samples
-from sparsestyle_ns.rendering.density_grid import DensityGrid
-from sparsestyle_ns.rendering.precision import Precision, autocast
-from sparsestyle_ns.rendering.sampling import even_edges
-from sparsestyle_ns.rendering.space import Segments
-from sparsestyle_ns.rendering.volume import DenseRender, render_coarse, seen_behind
-from sparsestyle_ns.schedules import ramp
+from sparsestyle_ns.metrics.image import image_metrics
+from sparsestyle_ns.rendering.render import DenseRender, render_coarse, seen_behind
+from sparsestyle_ns.utils.distributed import gather_rays, num_processes, shard_rays
+from sparsestyle_ns.utils.errors import InputError
 
 
 @dataclass
@@ -186,9 +186,9 @@ class CoarseFewShotModel(Model):
         thinning = Thinning(self.config.thinning, generator) if self.config.thinning > 0 else None
         if num_processes() == 1:
             return self.render(segments, directions, edges, thinning), edges
-        segments = self.space.segments(own_share(origins), own_share(directions))
-        own = self.render(segments, own_share(directions), own_share(edges), thinning)
-        return DenseRender(**{name: put_together(part, len(edges)) for name, part in vars(own).items()}), edges
+        segments = self.space.segments(shard_rays(origins), shard_rays(directions))
+        own = self.render(segments, shard_rays(directions), shard_rays(edges), thinning)
+        return DenseRender(**{name: gather_rays(part, len(edges)) for name, part in vars(own).items()}), edges
 
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
         """`rgb`, `accumulation`, and `depth` in world units; in training also what the losses need."""

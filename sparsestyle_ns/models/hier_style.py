@@ -12,23 +12,21 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor, nn
 from torch.nn import Parameter
 
+from sparsestyle_ns.core.occupancy import Occupancy, march
+from sparsestyle_ns.core.precision import Precision, autocast
+from sparsestyle_ns.core.spaces import ForwardFacingSpace, Segments
 from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.evaluation.image_metrics import image_metrics
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.field_components.point_encodings import FrequencyEncoding, NoEncoding, PointEncoding
 from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid, has_tiny_cuda_nn
 from sparsestyle_ns.fields.fine_tuned import FineTunedField
 from sparsestyle_ns.fields.residual import ResidualField
+from sparsestyle_ns.metrics.image import image_metrics
 from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
-from sparsestyle_ns.progress import bar
 from sparsestyle_ns.rendering.baked import BakedVolume, Rays, render_baked
-from sparsestyle_ns.rendering.density_grid import Occupancy, march
 from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
 from sparsestyle_ns.rendering.mixing import STYLISED, Mix
-from sparsestyle_ns.rendering.precision import Precision, autocast
-from sparsestyle_ns.rendering.space import ForwardFacingSpace, Segments
-from sparsestyle_ns.rendering.volume import (
+from sparsestyle_ns.rendering.render import (
     POINTS_PER_CALL,
     FrozenSamples,
     PackedRender,
@@ -37,7 +35,9 @@ from sparsestyle_ns.rendering.volume import (
     render_stylised,
     straight_color,
 )
-from sparsestyle_ns.undisturbed import undisturbed
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.progress import bar
+from sparsestyle_ns.utils.untraced import untraced
 
 RAYS_PER_CALL = 1 << 13
 """Rays that are marched at once; bounds the memory of the steps in empty space."""
@@ -355,7 +355,7 @@ class HierStyleModel(Model):
         with autocast(self.device, self.config.precision):
             return render_mixed(self.field, styles, frozen, ray_bundle.directions, self.background, mix)
 
-    @undisturbed
+    @untraced
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
         """`rgb` (stylised), `accumulation`, `depth` in world units, and the same of the coarse field as `…_coarse`."""
         segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)

@@ -12,14 +12,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from torch.amp import GradScaler
 
-from sparsestyle_ns.datamanager import FewShotDataManager, FewShotDataManagerConfig
 from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.effects.panel import EffectsPanel
 from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings
-from sparsestyle_ns.errors import InputError, exit_on_input_error
-from sparsestyle_ns.ffmpeg import put_ffmpeg_on_path
-from sparsestyle_ns.style.targets import StyleTargets
+from sparsestyle_ns.losses.stylization import StyleTargets
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, FewShotDataManagerConfig
 from sparsestyle_ns.style.vgg import VGGFeatures, load_backbone
+from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
+from sparsestyle_ns.utils.ffmpeg import put_ffmpeg_on_path
+from sparsestyle_ns.viewer.effects_panel import EffectsPanel
 
 TestMode = Literal["test", "val", "inference"]
 

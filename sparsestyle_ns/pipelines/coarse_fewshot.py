@@ -10,11 +10,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sparsestyle_ns.effects.registry import decide_again
-from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel, CoarseFewShotModelConfig
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
-from sparsestyle_ns.style.image import SMALLEST_SIDE
-from sparsestyle_ns.unseen_views import UnseenViews
+from sparsestyle_ns.pipelines.unseen_views import UnseenViews
+from sparsestyle_ns.style.painting import SMALLEST_SIDE
+from sparsestyle_ns.utils.errors import InputError
 
 
 @dataclass

@@ -15,22 +15,22 @@ from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
+from sparsestyle_ns.core.camera_paths import at_poses, poses_between
+from sparsestyle_ns.core.schedules import content_weight
 from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.evaluation.camera_path import at_poses, poses_between
-from sparsestyle_ns.finite_steps import broken, step_if_finite
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
+from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
-from sparsestyle_ns.processes import average_gradients, num_processes, own_share, put_together
-from sparsestyle_ns.progress import bar, say, track
 from sparsestyle_ns.rendering.frozen_view import FrozenView
-from sparsestyle_ns.rendering.volume import accumulation_of, seen_behind
-from sparsestyle_ns.schedules import content_weight
+from sparsestyle_ns.rendering.render import accumulation_of, seen_behind
 from sparsestyle_ns.style.color import apply_palette, color_moments
-from sparsestyle_ns.style.image import load_style_image
-from sparsestyle_ns.style.targets import StyleTargets
+from sparsestyle_ns.style.painting import load_style_image
 from sparsestyle_ns.style.vgg import VGGFeatures
+from sparsestyle_ns.utils.distributed import average_gradients, gather_rays, num_processes, shard_rays
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.progress import bar, say, track
+from sparsestyle_ns.utils.skip_nonfinite import broken, step_if_finite
 from sparsestyle_ns.viewer.panel import StylePanel
 
 
@@ -261,7 +261,7 @@ class HierStylePipeline(CheckedPipeline):
             rows = slice(pixels.starts[index], pixels.starts[index + 1])
             frozen = self._freeze(pixels.origins[rows], pixels.directions[rows], keep_bytes)
             keep_bytes -= frozen.kept_bytes
-            accumulation = put_together(frozen.render(accumulation_of), height * width)
+            accumulation = gather_rays(frozen.render(accumulation_of), height * width)
             picture = self._photo(index, pixels.colors[rows], accumulation).view(height, width, 3)
             views.append(SceneView(frozen, picture, accumulation.view(height, width)))
         for camera in track(self._novel_cameras(), "Caching novel views"):
@@ -298,13 +298,13 @@ class HierStylePipeline(CheckedPipeline):
 
     def _freeze(self, origins: Tensor, directions: Tensor, keep_bytes: float) -> FrozenView:
         """The rays of a view that this process renders."""
-        origins, directions = own_share(origins), own_share(directions)
+        origins, directions = shard_rays(origins), shard_rays(directions)
         return self.model.freeze_view(origins, directions, self.config.samples_per_chunk, keep_bytes)
 
     def _render(self, view: ContentView, style: nn.Module, coarse_geometry: bool = False) -> Float[Tensor, "H W 3"]:
         """The stylised picture of a view, of which each process renders its share of the rays."""
         own = view.frozen.render(lambda chunk: self.model.stylised(chunk, coarse_geometry, style).rgb)
-        return put_together(own, view.picture[..., 0].numel()).view(view.picture.shape)
+        return gather_rays(own, view.picture[..., 0].numel()).view(view.picture.shape)
 
     def _novel_cameras(self) -> List[Cameras]:
         """Cameras half way, a third of the way … between neighbouring training views."""

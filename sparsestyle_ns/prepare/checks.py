@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from sparsestyle_ns.progress import track
+from sparsestyle_ns.utils.progress import track
 
 COMPARED_SIDE = 1000
 """Pixels along the longer side of the pictures that are compared, at most."""

@@ -12,8 +12,6 @@ from typing import Dict, List, Literal, Optional, Sequence
 
 import torch
 
-from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.ffmpeg import put_ffmpeg_on_path
 from sparsestyle_ns.prepare.checks import check_photos
 from sparsestyle_ns.prepare.photos import (
     MIN_PHOTOS,
@@ -25,6 +23,8 @@ from sparsestyle_ns.prepare.photos import (
     write_photos,
 )
 from sparsestyle_ns.prepare.poses import TRANSFORMS, Poses, find_poses, fits
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.ffmpeg import put_ffmpeg_on_path
 
 PoseSource = Literal["auto", "file", "colmap"]
 

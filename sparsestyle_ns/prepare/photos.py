@@ -6,7 +6,7 @@ from typing import List, Sequence, Tuple
 
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.utils.errors import InputError
 
 HEIC_SUFFIXES = (".heic", ".heif")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", *HEIC_SUFFIXES)

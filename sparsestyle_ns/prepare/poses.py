@@ -9,10 +9,10 @@ from typing import Any, Callable, Dict, List, Optional, Sequence
 
 import numpy as np
 
-from sparsestyle_ns.dataparsers.llff import read_poses_bounds
-from sparsestyle_ns.dataparsers.transforms import check_lenses, read_transforms
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.data.llff import read_poses_bounds
+from sparsestyle_ns.data.transforms import check_lenses, read_transforms
 from sparsestyle_ns.prepare.photos import MIN_PHOTOS, Framing, Size
+from sparsestyle_ns.utils.errors import InputError
 
 POSES_BOUNDS, TRANSFORMS = "poses_bounds.npy", "transforms.json"
 ASPECT_TOLERANCE = 0.02

@@ -19,19 +19,19 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from sparsestyle_ns.kernels import even_parts, run_on_threads
+from sparsestyle_ns.core.occupancy import Occupancy
+from sparsestyle_ns.core.sampling import even_edges
+from sparsestyle_ns.core.spaces import MAX_DISTANCE, ContractedSegments, LinearSegments, Segments, spacing
 from sparsestyle_ns.rendering import baked_kernels
-from sparsestyle_ns.rendering.density_grid import Occupancy
 from sparsestyle_ns.rendering.mixing import STYLISED, Appearance, Mix, mixed
-from sparsestyle_ns.rendering.sampling import even_edges
-from sparsestyle_ns.rendering.space import MAX_DISTANCE, ContractedSegments, LinearSegments, Segments, spacing
-from sparsestyle_ns.rendering.volume import (
+from sparsestyle_ns.rendering.render import (
     POINTS_PER_CALL,
     PackedRender,
     composite,
     render_packed,
     visible_samples,
 )
+from sparsestyle_ns.utils.numba_kernels import even_parts, run_on_threads
 
 Shade = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points 8"]]
 """Gives σ_c, σ_f, c_f and c_c at field coordinates, in this order."""

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sparsestyle_ns.kernels import kernel
-from sparsestyle_ns.rendering.compositing import MAX_OPTICAL_DEPTH
-from sparsestyle_ns.rendering.space import MAX_DISTANCE
+from sparsestyle_ns.core.spaces import MAX_DISTANCE
+from sparsestyle_ns.core.volrend import MAX_OPTICAL_DEPTH
+from sparsestyle_ns.utils.numba_kernels import kernel
 
 LOOKAHEAD = 6
 """Samples of a ray that may turn out to be missing before the ray waits for them."""

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from sparsestyle_ns.rendering.volume import FrozenSamples
+from sparsestyle_ns.rendering.render import FrozenSamples
 
 
 def split_by_samples(counts: Int[Tensor, "rays"], max_samples: int) -> List[slice]:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.utils.errors import InputError
 
 SMALLEST_SPREAD = 1 / 255
 """Standard deviation, in units of the colour range, below which a direction counts as a rounding error."""

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.utils.errors import InputError
 
 FEATURE_CHANNELS = 768
 """Channels of relu3_1, relu3_2 and relu3_3 together."""

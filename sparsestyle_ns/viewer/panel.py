@@ -25,13 +25,13 @@ from nerfstudio.viewer.viewer_elements import (
 from torch import nn
 
 from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
 from sparsestyle_ns.models.hier_style import RENDER_MODES, Look
-from sparsestyle_ns.names import free_name
 from sparsestyle_ns.rendering.mixing import Mix
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.names import free_name
 from sparsestyle_ns.viewer.baking import Baker
 from sparsestyle_ns.viewer.elements import Markdown, ProgressBar, UploadButton
-from sparsestyle_ns.viewer.restyling import Progress, Restyling, Workshop
 from sparsestyle_ns.viewer.styles import (
     Style,
     StyleImage,

@@ -16,15 +16,15 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch.nn.functional import normalize
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sparsestyle_ns.datamanager import FewShotDataManagerConfig
-from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
+from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace
+from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import EffectSettings
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig, CoarseFieldConfig
 from sparsestyle_ns.models.hier_style import HierStyleModelConfig
 from sparsestyle_ns.pipelines import base as pipelines
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
-from sparsestyle_ns.rendering.space import BoxSpace, ContractedSpace, ForwardFacingSpace
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 
 BOX = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
 NDC = {"space": "ndc", "ndc_focal_over_half_size": [1.5, 2.0], "ndc_near": 0.7, "ndc_depth_range": [1.0, 9.0]}

@@ -12,11 +12,11 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from sparsestyle_ns.cli import main
-from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
+from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import ALL_AUTO, EFFECTS, EffectSettings, decide, decide_again
 from sparsestyle_ns.effects.scene import Scene
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.utils.errors import InputError
 
 DATA = Path(os.environ.get("SPARSESTYLE_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 PARSERS = {

@@ -7,12 +7,8 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
-from sparsestyle_ns.effects.exposure import Exposure, fit_gains
-from sparsestyle_ns.effects.layouts import meeting_point, viewing_spread
-from sparsestyle_ns.effects.lens_distortion import LensDistortion, largest_shift
-from sparsestyle_ns.effects.matched_depth import MatchedDepth, matched_rays
-from sparsestyle_ns.effects.matches import (
+from sparsestyle_ns.data.llff import LLFFDataParserConfig
+from sparsestyle_ns.data.matches import (
     LENSES,
     PointMatches,
     distances_along,
@@ -22,9 +18,13 @@ from sparsestyle_ns.effects.matches import (
     sample,
     undistorted,
 )
+from sparsestyle_ns.effects.exposure import Exposure, fit_gains
+from sparsestyle_ns.effects.layouts import meeting_point, viewing_spread
+from sparsestyle_ns.effects.lens_distortion import LensDistortion, largest_shift
+from sparsestyle_ns.effects.matched_depth import MatchedDepth, matched_rays
 from sparsestyle_ns.effects.scene import Scene, border, read_rgba
 from sparsestyle_ns.effects.view_color import ViewColor
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.utils.errors import InputError
 
 
 def camera_at(position, back) -> np.ndarray:

@@ -12,14 +12,14 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from torch import Tensor
 
-from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
+from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings, decide
+from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.evaluation.held_out import evaluate_held_out
-from sparsestyle_ns.evaluation.image_metrics import psnr
-from sparsestyle_ns.evaluation.training import Training
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.style.color import color_moments, gaussian_distance
-from sparsestyle_ns.style.image import load_style_image
+from sparsestyle_ns.style.painting import load_style_image
 
 SEEDS = (0, 1, 2)
 """Short trainings of one scene with different seeds differ by up to a decibel, so means over some are compared."""

@@ -9,14 +9,14 @@ import torch
 import yaml
 from conftest import TINY, TINY_STYLE, decided, ns_train, only_run
 
-import sparsestyle_ns.datamanager as datamanager
-from sparsestyle_ns.coarse_run import newest_checkpoint
+import sparsestyle_ns.pipelines.datamanager as datamanager
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.exposure import ExposureCorrection
-from sparsestyle_ns.effects.panel import EffectsPanel
 from sparsestyle_ns.effects.registry import EFFECTS
 from sparsestyle_ns.gallery.page import RunPictures, gallery_page
-from sparsestyle_ns.run_folder import find_config, load_run
+from sparsestyle_ns.runs.coarse_run import newest_checkpoint
+from sparsestyle_ns.runs.run_folder import find_config, load_run
+from sparsestyle_ns.viewer.effects_panel import EffectsPanel
 
 AUTO = [flag for flag in TINY if flag not in ("--pipeline.effects.empty-space", "on")]
 

@@ -10,7 +10,7 @@ from conftest import run_entrypoint
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.evaluation.held_out import by_figure, evaluate_held_out, evaluate_run, saved_report
 from sparsestyle_ns.evaluation.tables import report_tables
-from sparsestyle_ns.run_folder import find_config, load_run
+from sparsestyle_ns.runs.run_folder import find_config, load_run
 
 
 def test_baked_renders_are_held_against_exact_ones_when_asked_for(runs: SimpleNamespace, tmp_path: Path) -> None:

@@ -7,9 +7,9 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import SceneBox
 
+from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace
 from sparsestyle_ns.export.orbit import Orbit, make_orbit
 from sparsestyle_ns.export.voxels import EMPTY, Voxels
-from sparsestyle_ns.rendering.space import BoxSpace, ContractedSpace, ForwardFacingSpace
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 NUM_STEPS = 48

@@ -11,10 +11,10 @@ from small_scenes import HEIGHT, KINDS, WIDTH, psnr, scene
 from torchvision.transforms.functional import to_tensor
 
 from sparsestyle_ns.cli import main
-from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.export.command import page_picture
 from sparsestyle_ns.export.orbit import turned
 from sparsestyle_ns.export.page import build_page, fit_page, unpack
+from sparsestyle_ns.utils.errors import InputError
 
 READY = "document.body.dataset.state === 'ready'"
 SETTLED = "document.body.dataset.state !== 'moving'"

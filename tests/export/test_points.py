@@ -11,7 +11,6 @@ from nerfstudio.cameras.cameras import Cameras
 from plyfile import PlyData
 
 from sparsestyle_ns.cli import main
-from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.export import command
 from sparsestyle_ns.export.mesh import picture_of_mesh, poisson_mesh
 from sparsestyle_ns.export.points import (
@@ -26,7 +25,8 @@ from sparsestyle_ns.export.points import (
     without_background,
 )
 from sparsestyle_ns.models.hier_style import HierStyleModel
-from sparsestyle_ns.rendering.volume import over_background
+from sparsestyle_ns.rendering.render import over_background
+from sparsestyle_ns.utils.errors import InputError
 
 WIDTH, HEIGHT = 96, 72
 

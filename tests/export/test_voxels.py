@@ -7,12 +7,12 @@ import pytest
 import torch
 from small_scenes import KINDS, NUM_STEPS, balls, psnr, scene
 
+from sparsestyle_ns.core.occupancy import Occupancy
 from sparsestyle_ns.evaluation.held_out import exact_outputs
 from sparsestyle_ns.export.command import load_scene, median_depth, page_picture
 from sparsestyle_ns.export.orbit import make_orbit, resized, survey, turned
 from sparsestyle_ns.export.voxels import Voxels, bake_voxels, interpolate, last_step_cells, render_voxels
 from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT
-from sparsestyle_ns.rendering.density_grid import Occupancy
 from sparsestyle_ns.rendering.mixing import Mix
 
 

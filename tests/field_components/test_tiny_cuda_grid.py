@@ -7,7 +7,6 @@ import reference
 import torch
 from nerfstudio.field_components import encodings
 
-from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.field_components.hash_grid import interpolate
 from sparsestyle_ns.field_components.tiny_cuda_grid import (
     TinyCudaGrid,
@@ -16,6 +15,7 @@ from sparsestyle_ns.field_components.tiny_cuda_grid import (
     tiny_cuda_levels,
 )
 from sparsestyle_ns.fields.residual import ResidualField
+from sparsestyle_ns.utils.errors import InputError
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda")
 SHAPE = {"num_levels": 3, "min_resolution": 4, "max_resolution": 12, "features_per_level": 2, "log2_table_size": 9}

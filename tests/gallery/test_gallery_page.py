@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.evaluation.tables import Table
 from sparsestyle_ns.gallery.page import THUMBNAIL_SIDE, Film, Picture, RunPictures, View, gallery_page
-from sparsestyle_ns.page import data_uri, write_page
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.page import data_uri, write_page
 
 MP4 = b"\x00\x00\x00\x18ftypmp42 the rest of a film"
 

@@ -5,8 +5,10 @@ import torch
 from hard.table import hard_case
 from nerfstudio.data.scene_box import SceneBox
 
-from sparsestyle_ns.fields.coarse import CoarseField, activate_density
-from sparsestyle_ns.rendering.compositing import (
+from sparsestyle_ns.core.occupancy import DensityGrid
+from sparsestyle_ns.core.sampling import even_edges, sample_pdf
+from sparsestyle_ns.core.spaces import BoxSpace
+from sparsestyle_ns.core.volrend import (
     dense_weights,
     distortion,
     effective_samples,
@@ -14,10 +16,8 @@ from sparsestyle_ns.rendering.compositing import (
     packed_transmittance,
     packed_weights,
 )
-from sparsestyle_ns.rendering.density_grid import DensityGrid
-from sparsestyle_ns.rendering.sampling import edges_from_histogram, even_edges
-from sparsestyle_ns.rendering.space import BoxSpace
-from sparsestyle_ns.rendering.volume import over_background, render_coarse
+from sparsestyle_ns.fields.coarse import CoarseField, activate_density
+from sparsestyle_ns.rendering.render import over_background, render_coarse
 
 INFINITY = math.inf
 CUBE = BoxSpace(SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])))
@@ -400,7 +400,7 @@ def test_borders_of_extreme_histograms_ascend(bins):
     histograms = torch.cat([spike, only, of_all_magnitudes((40, bins), -30, 0).float(), torch.full((1, bins), 1e30)])
     borders = 0.3 + 0.6 * even_edges(len(histograms), bins, torch.device("cpu"), torch.Generator().manual_seed(0))
     for generator in (None, torch.Generator().manual_seed(1)):
-        edges = edges_from_histogram(borders, histograms, 200, generator)
+        edges = sample_pdf(borders, histograms, 200, generator)
         assert edges.isfinite().all() and (edges.diff(dim=-1) >= 0).all()
         assert torch.equal(edges[:, [0, -1]], borders[:, [0, -1]])
 

@@ -17,14 +17,14 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from PIL import Image
 from test_commands import write_ring, write_transforms
 
-from sparsestyle_ns.datamanager import FewShotDataManagerConfig
-from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig, read_poses_bounds
-from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.photos import open_photo, photo_size
+from sparsestyle_ns.data.llff import LLFFDataParserConfig, read_poses_bounds
+from sparsestyle_ns.data.photos import open_photo, photo_size
+from sparsestyle_ns.data.view_selection import select_views
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.prepare.photos import frame_photos
 from sparsestyle_ns.prepare.poses import TransformsPoses, fits
-from sparsestyle_ns.style.image import load_style_image
-from sparsestyle_ns.view_selection import select_views
+from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.utils.errors import InputError
 
 FUZZ = settings(
     derandomize=True,

@@ -6,20 +6,20 @@ from hard.table import hard_case
 from nerfstudio.data.scene_box import SceneBox
 from torch.nn.functional import normalize
 
-from sparsestyle_ns.effects.layouts import Contraction
-from sparsestyle_ns.fields.coarse import CoarseField
-from sparsestyle_ns.rendering.baked_kernels import _is_occupied
-from sparsestyle_ns.rendering.density_grid import DensityGrid, Occupancy, march
-from sparsestyle_ns.rendering.ndc import ndc_distance, ndc_points, ndc_rays
-from sparsestyle_ns.rendering.sampling import even_edges
-from sparsestyle_ns.rendering.space import (
+from sparsestyle_ns.core.ndc import ndc_distance, ndc_points, ndc_rays
+from sparsestyle_ns.core.occupancy import DensityGrid, Occupancy, march
+from sparsestyle_ns.core.sampling import even_edges
+from sparsestyle_ns.core.spaces import (
     BoxSpace,
     ContractedSpace,
     ForwardFacingSpace,
     contract,
     intersect_box,
 )
-from sparsestyle_ns.rendering.volume import render_coarse
+from sparsestyle_ns.effects.layouts import Contraction
+from sparsestyle_ns.fields.coarse import CoarseField
+from sparsestyle_ns.rendering.baked_kernels import _is_occupied
+from sparsestyle_ns.rendering.render import render_coarse
 
 FOCAL = (1.6, 2.1)
 CUBE = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])

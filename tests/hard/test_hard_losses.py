@@ -6,7 +6,7 @@ from sparsestyle_ns.losses.content import content_loss
 from sparsestyle_ns.losses.geometry import near_density
 from sparsestyle_ns.losses.nnfm import StyleIndex, nearest_neighbors, nnfm_loss
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
-from sparsestyle_ns.style.targets import StyleTargets, feature_rows, fit_side
+from sparsestyle_ns.losses.stylization import StyleTargets, feature_rows, fit_side
 from sparsestyle_ns.style.vgg import VGGFeatures, load_backbone
 
 CHANNELS = 32

@@ -2,8 +2,8 @@ import pytest
 import torch
 from hard.table import hard_case
 
-from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.style.color import SMALLEST_SPREAD, apply_palette, color_moments, palette_transform
+from sparsestyle_ns.utils.errors import InputError
 
 
 def colors_of(seed, count=500):

@@ -10,9 +10,9 @@ from hard.table import hard_case
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from PIL import Image
 
-from sparsestyle_ns.datamanager import FewShotDataManagerConfig
-from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.data.llff import LLFFDataParserConfig
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
+from sparsestyle_ns.utils.errors import InputError
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,11 @@ from hard.table import hard_case
 from torch import nn
 from torch.amp import GradScaler
 
-from sparsestyle_ns import processes
-from sparsestyle_ns.coarse_run import load_checkpoint, newest_checkpoint
-from sparsestyle_ns.finite_steps import FiniteOptimizers
-from sparsestyle_ns.run_folder import load_run
-from sparsestyle_ns.trainer import FusedAdamConfig
+from sparsestyle_ns.engine.trainer import FusedAdamConfig
+from sparsestyle_ns.runs.coarse_run import load_checkpoint, newest_checkpoint
+from sparsestyle_ns.runs.run_folder import load_run
+from sparsestyle_ns.utils import distributed as processes
+from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 
 TWO = ["--machine.num-devices", "2", "--machine.device-type", "cpu"]
 COMMON = ["--pipeline.model.precision", "float32", "--max-num-iterations", "6", "--steps-per-eval-image", "0"]
@@ -159,8 +159,8 @@ def test_an_unseen_views_gradient_in_two_processes_is_that_in_one(llff_scene, tm
 def _square_in_shares(rank: int) -> torch.Tensor:
     weight = nn.Parameter(torch.tensor([2.0, 3.0]))
     rows = torch.arange(14.0).view(7, 2)
-    own = (processes.own_share(rows) * weight).square()
-    whole = processes.put_together(own, 7)
+    own = (processes.shard_rays(rows) * weight).square()
+    whole = processes.gather_rays(own, 7)
     whole.cos().mean().backward()
     processes.average_gradients([weight])
     return torch.cat([whole.detach().flatten(), weight.grad])
@@ -181,7 +181,7 @@ def test_shares_put_together_are_the_whole_with_its_gradient(tmp_path):
 
 def test_one_process_gets_back_what_it_gave():
     values = torch.rand(5, 3)
-    assert processes.own_share(values) is values
-    assert processes.put_together(values, 5) is values
+    assert processes.shard_rays(values) is values
+    assert processes.gather_rays(values, 5) is values
     assert processes.from_first_process(values) is values
     assert processes.any_process(True, values.device) is True

@@ -2,9 +2,9 @@ import pytest
 import torch
 from hard.table import hard_case
 
+from sparsestyle_ns.core.volrend import dense_weights, optical_depth
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.residual import ResidualField, fine_density
-from sparsestyle_ns.rendering.compositing import dense_weights, optical_depth
 
 LENGTH = 0.1
 

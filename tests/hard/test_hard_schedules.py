@@ -5,8 +5,8 @@ import pytest
 import reference
 from hard.table import hard_case
 
-from sparsestyle_ns.errors import InputError
-from sparsestyle_ns.schedules import content_weight, ramp
+from sparsestyle_ns.core.schedules import content_weight, ramp
+from sparsestyle_ns.utils.errors import InputError
 
 
 @hard_case(

@@ -14,12 +14,12 @@ from PIL import Image
 from torch import nn
 from torch.amp import GradScaler
 
-from sparsestyle_ns.coarse_run import load_checkpoint, newest_checkpoint
-from sparsestyle_ns.finite_steps import FiniteOptimizers, broken
+from sparsestyle_ns.core.occupancy import DensityGrid
+from sparsestyle_ns.engine.trainer import FusedAdamConfig, SparseStyleTrainer
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
-from sparsestyle_ns.rendering.density_grid import DensityGrid
-from sparsestyle_ns.trainer import FusedAdamConfig, SparseStyleTrainer
+from sparsestyle_ns.runs.coarse_run import load_checkpoint, newest_checkpoint
+from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers, broken
 
 PIPELINES = {"coarse-fewshot": CoarseFewShotPipeline, "hier-style": HierStylePipeline}
 BOTH = pytest.mark.parametrize("method", list(PIPELINES))

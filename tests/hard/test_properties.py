@@ -24,7 +24,10 @@ import sparsestyle_ns.field_components
 import sparsestyle_ns.losses
 import sparsestyle_ns.rendering
 import sparsestyle_ns.style
-from sparsestyle_ns import schedules
+from sparsestyle_ns.core import ndc, precision, sampling, schedules
+from sparsestyle_ns.core import occupancy as density_grid
+from sparsestyle_ns.core import spaces as space
+from sparsestyle_ns.core import volrend as compositing
 from sparsestyle_ns.effects.layouts import BoundedBox, Contraction, ForwardFacing
 from sparsestyle_ns.field_components import (
     hash_grid,
@@ -36,19 +39,11 @@ from sparsestyle_ns.field_components import (
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.losses import content, geometry, nnfm, reconstruction, semantic
-from sparsestyle_ns.rendering import (
-    baked,
-    compositing,
-    density_grid,
-    frozen_view,
-    mixing,
-    ndc,
-    precision,
-    sampling,
-    space,
-    volume,
-)
-from sparsestyle_ns.style import color, image, targets, vgg
+from sparsestyle_ns.losses import stylization as targets
+from sparsestyle_ns.rendering import baked, frozen_view, mixing
+from sparsestyle_ns.rendering import render as volume
+from sparsestyle_ns.style import color, vgg
+from sparsestyle_ns.style import painting as image
 
 PACKAGES = [
     sparsestyle_ns.rendering,
@@ -195,14 +190,14 @@ def test_the_spread_of_weights_is_a_number_in_its_range(data, num_rays, samples,
         assert gradient.isfinite().all() or value is counted
 
 
-@covers(sampling.even_edges, sampling.edges_from_histogram)
+@covers(sampling.even_edges, sampling.sample_pdf)
 @given(st.data(), COUNTS, st.integers(1, 300), st.integers(1, 300), st.booleans())
 def test_borders_ascend_from_0_to_1(data, num_rays, bins, samples, jitter):
     generator = torch.Generator().manual_seed(data.draw(SEEDS)) if jitter else None
     even = sampling.even_edges(num_rays, bins, torch.device("cpu"), generator)
     masses = data.draw(tensors((num_rays, bins), -30, 30, dtype=torch.float32))
     masses[:, data.draw(st.integers(0, bins - 1))] += 1e-20
-    for edges in (even, sampling.edges_from_histogram(even, masses, samples, generator)):
+    for edges in (even, sampling.sample_pdf(even, masses, samples, generator)):
         assert (edges.diff(dim=-1) >= 0).all()
         assert (edges[:, 0] == 0).all() and (edges[:, -1] == 1).all()
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Callable, List, Optional
 
 CONTEXT = get_context("forkserver")
-CONTEXT.set_forkserver_preload(["hard.trial", "conftest", "nerfstudio.scripts.train", "sparsestyle_ns.trainer"])
+CONTEXT.set_forkserver_preload(["hard.trial", "conftest", "nerfstudio.scripts.train", "sparsestyle_ns.engine.trainer"])
 
 
 def start(target: Callable[..., None], log: Path, *arguments: Any) -> BaseProcess:
@@ -49,7 +49,7 @@ def _after_iteration(last: int) -> Callable[[], None]:
     """Killed when an iteration's step is taken, and not saved."""
 
     def arm() -> None:
-        from sparsestyle_ns.trainer import SparseStyleTrainer
+        from sparsestyle_ns.engine.trainer import SparseStyleTrainer
 
         iterate = SparseStyleTrainer.train_iteration
 

@@ -9,7 +9,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.field_components import encodings
 from torch.nn.functional import normalize
 
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.engine.trainer import FusedAdamConfig
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.field_components.point_encodings import NoEncoding
 from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid
@@ -17,7 +17,7 @@ from sparsestyle_ns.models import hier_style
 from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
 from sparsestyle_ns.models.hier_style import MOST_BAKED, HierStyleModelConfig, Look
 from sparsestyle_ns.rendering.mixing import Mix
-from sparsestyle_ns.trainer import FusedAdamConfig
+from sparsestyle_ns.utils.errors import InputError
 
 BOX = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 

@@ -24,10 +24,10 @@ from photo_sets import (
 from PIL import ExifTags, Image
 
 from sparsestyle_ns.cli import main
-from sparsestyle_ns.datamanager import read_scene
-from sparsestyle_ns.dataparsers.llff import LLFFDataParserConfig
-from sparsestyle_ns.errors import InputError
+from sparsestyle_ns.data.llff import LLFFDataParserConfig
+from sparsestyle_ns.pipelines.datamanager import read_scene
 from sparsestyle_ns.prepare.command import prepare_scene
+from sparsestyle_ns.utils.errors import InputError
 
 
 def parse_llff(folder):

@@ -3,6 +3,8 @@ import torch
 from nerfstudio.data.scene_box import SceneBox
 from torch.nn.functional import normalize
 
+from sparsestyle_ns.core.occupancy import Occupancy, march
+from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace, Segments
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
@@ -19,9 +21,7 @@ from sparsestyle_ns.rendering.baked import (
     render_baked,
 )
 from sparsestyle_ns.rendering.baked_kernels import LOOKAHEAD
-from sparsestyle_ns.rendering.density_grid import Occupancy, march
-from sparsestyle_ns.rendering.space import BoxSpace, ContractedSpace, ForwardFacingSpace, Segments
-from sparsestyle_ns.rendering.volume import SAMPLES_PER_PASS, render_packed
+from sparsestyle_ns.rendering.render import SAMPLES_PER_PASS, render_packed
 
 STEPS = 24
 CUBE = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))

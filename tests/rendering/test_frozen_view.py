@@ -2,13 +2,13 @@ import pytest
 import torch
 from nerfstudio.data.scene_box import SceneBox
 
+from sparsestyle_ns.core.occupancy import Occupancy
+from sparsestyle_ns.core.spaces import BoxSpace
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
-from sparsestyle_ns.rendering.density_grid import Occupancy
 from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
-from sparsestyle_ns.rendering.space import BoxSpace
-from sparsestyle_ns.rendering.volume import freeze_samples, render_stylised
+from sparsestyle_ns.rendering.render import freeze_samples, render_stylised
 
 RAYS, STEPS = 20, 10
 SPACE = BoxSpace(SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])))

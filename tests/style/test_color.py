@@ -3,7 +3,6 @@ import pytest
 import reference
 import torch
 
-from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.style.color import (
     SMALLEST_SPREAD,
     apply_palette,
@@ -11,6 +10,7 @@ from sparsestyle_ns.style.color import (
     gaussian_distance,
     palette_transform,
 )
+from sparsestyle_ns.utils.errors import InputError
 
 
 def correlated_colors(seed, count=500, dtype=torch.float64):

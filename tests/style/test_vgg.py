@@ -11,11 +11,11 @@ from urllib.error import URLError
 import pytest
 import torch
 
-from sparsestyle_ns.errors import InputError
 from sparsestyle_ns.losses.content import content_loss
 from sparsestyle_ns.losses.nnfm import nnfm_loss
 from sparsestyle_ns.style import vgg
 from sparsestyle_ns.style.vgg import load_backbone
+from sparsestyle_ns.utils.errors import InputError
 
 IMAGENET_MEAN = torch.tensor([0.485, 0.456, 0.406]).view(3, 1, 1)
 IMAGENET_STD = torch.tensor([0.229, 0.224, 0.225]).view(3, 1, 1)

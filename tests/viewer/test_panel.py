@@ -25,15 +25,15 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer import Viewer
 from PIL import Image
 
-from sparsestyle_ns.evaluation.training import Training
+from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
+from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.export.command import load_scene
 from sparsestyle_ns.gallery.collect import collect_run
 from sparsestyle_ns.models.hier_style import MOST_BAKED
 from sparsestyle_ns.pipelines.hier_style import StepLosses
-from sparsestyle_ns.run_folder import find_config, load_run
+from sparsestyle_ns.runs.run_folder import find_config, load_run
 from sparsestyle_ns.viewer.baking import STEPS_BETWEEN
 from sparsestyle_ns.viewer.panel import NO_BLEND, StylePanel
-from sparsestyle_ns.viewer.restyling import Progress, Restyling, Workshop
 from sparsestyle_ns.viewer.styles import Style, StyleImage, plain
 
 
@@ -348,8 +348,8 @@ def own_style_alone(panel: StylePanel) -> Iterator[None]:
     "broken, error",
     [
         ("torch.save", RuntimeError("PytorchStreamWriter failed writing file\ndata/0")),
-        ("sparsestyle_ns.viewer.restyling.tempfile.mkdtemp", OSError("no room")),
-        ("sparsestyle_ns.viewer.restyling.save_thumbnail", ValueError("anything else")),
+        ("sparsestyle_ns.engine.restyling.tempfile.mkdtemp", OSError("no room")),
+        ("sparsestyle_ns.engine.restyling.save_thumbnail", ValueError("anything else")),
     ],
 )
 def test_a_style_that_cant_be_saved_is_there_and_says_so_and_leaves_no_folder(
@@ -378,7 +378,7 @@ def test_two_restylings_of_a_second_are_two_runs(panel: StylePanel, monkeypatch:
         def now(cls) -> datetime:
             return next(cls.times)
 
-    monkeypatch.setattr("sparsestyle_ns.viewer.restyling.datetime", StandingClock)
+    monkeypatch.setattr("sparsestyle_ns.engine.restyling.datetime", StandingClock)
     restyling = Restyling(panel._workshop, StyleImage.received("a.png", png(1)), iterations=1)
     for _ in restyling:
         pass

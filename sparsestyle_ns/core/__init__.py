@@ -1,0 +1,1 @@
+"""Pure functions: rays, samples, weights, spaces and schedules. No configs, no nerfstudio models."""

@@ -1,0 +1,131 @@
+"""Paths of cameras that are fixed by the training cameras, without chance or choice.
+
+One is that on which consistency is measured; others, made of the same pieces, show a scene in a film, and have views
+that nobody photographed.
+"""
+
+import itertools
+import math
+from typing import List
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.camera_utils import get_interpolated_poses
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from sparsestyle_ns.utils.errors import InputError
+
+NUM_FRAMES = 24
+"""Frames of the path, at least."""
+ARC_STEP = math.radians(2.0)
+"""Angle between neighbouring frames of an arc."""
+FACING = math.cos(math.radians(60.0))
+"""Cameras all of whose view directions are at least this close (cosine) to their mean look one way."""
+FLIGHT_STEPS = 20
+"""Poses of a flight that a frame chooses from, so that its speed can change without jerks."""
+
+
+def measuring_path(cameras: Cameras) -> Cameras:
+    """The measuring path's cameras, one a frame, with the first training camera's lens, undistorted.
+
+    Where the training cameras look one way, the path leads from each to the next in their order, in steps of equal
+    parts; where they stand all around, it is an arc around the point that they look at, level with them on average,
+    in steps of 2° from the first one's side on.
+
+    Args:
+        cameras: the training cameras, two or more.
+
+    Raises:
+        InputError: there are fewer than two.
+    """
+    if len(cameras) < 2:
+        raise InputError("Consistency is measured between training views, and there is one; train on two or more.")
+    poses = cameras.camera_to_worlds.cpu().float()
+    return at_poses(poses_between(poses) if look_one_way(poses) else poses_around(poses), cameras)
+
+
+def showing_path(cameras: Cameras, frames: int) -> Cameras:
+    """A closed path that shows a scene, one camera a frame, with the first training camera's lens, undistorted.
+
+    Where the training cameras look one way, a flight through them there and back, which is slow where it turns; where
+    they stand all around, one full turn about the point that they look at, level with them on average.
+
+    Args:
+        cameras: the training cameras, two or more.
+        frames: how many; the last is just before the first.
+    """
+    poses = cameras.camera_to_worlds.cpu().float()
+    if not look_one_way(poses):
+        return unseen_places(cameras, frames)
+    fine = poses_between(poses, FLIGHT_STEPS * frames)
+    place = 0.5 - 0.5 * torch.cos(torch.arange(frames) * (2.0 * math.pi / frames))
+    return at_poses(fine[(place * (len(fine) - 1)).round().long()], cameras)
+
+
+def unseen_places(cameras: Cameras, count: int) -> Cameras:
+    """Cameras at equal steps where photos might have been taken, with the first training camera's lens, undistorted.
+
+    Where the training cameras look one way, on the way from each to the next in their order; where they stand all
+    around, on the circle about the point that they look at, level with them on average.
+
+    Args:
+        cameras: the training cameras, two or more.
+        count: how many; a few more may be given on a way.
+    """
+    # In float64, whose rounding, which differs with where vectors lie in memory, doesn't reach the float32 result.
+    poses = cameras.camera_to_worlds.cpu().double()
+    if look_one_way(poses):
+        return at_poses(poses_between(poses, count), cameras)
+    return at_poses(poses_around(poses, 2.0 * math.pi / count, count), cameras)
+
+
+def look_one_way(poses: Float[Tensor, "cameras 3 4"]) -> bool:
+    """Whether no camera looks farther than `FACING` aside from the mean direction."""
+    forward = -poses[:, :, 2]
+    mean = torch.nn.functional.normalize(forward.mean(dim=0), dim=0)
+    return bool((forward @ mean > FACING).all())
+
+
+def at_poses(poses: Float[Tensor, "frames 3 4"], cameras: Cameras) -> Cameras:
+    """Cameras at these poses, on the device of `cameras` and with the lens of the first of them, undistorted."""
+    count = len(poses)
+    return Cameras(
+        camera_to_worlds=poses.to(cameras.camera_to_worlds),
+        **{name: getattr(cameras, name)[:1].expand(count, 1) for name in ("fx", "fy", "cx", "cy", "width", "height")},
+    )
+
+
+def poses_between(poses: Float[Tensor, "cameras 3 4"], frames: int = NUM_FRAMES) -> Float[Tensor, "all 3 4"]:
+    """Poses from each camera to the next; equally many, `frames` at least in all, in each gap."""
+    steps = -(-(frames - 1) // (len(poses) - 1))
+    path: List[Tensor] = [poses[0]]
+    for first, second in itertools.pairwise(poses):
+        between = get_interpolated_poses(first.numpy(), second.numpy(), steps + 1)
+        path += [torch.tensor(pose[:3], dtype=poses.dtype) for pose in between[1:]]
+    return torch.stack(path)
+
+
+def poses_around(
+    poses: Float[Tensor, "cameras 3 4"], step: float = ARC_STEP, frames: int = NUM_FRAMES
+) -> Float[Tensor, "frames 3 4"]:
+    """An arc of so many poses, `step` radians apart, around the point closest to all optical axes, with z up."""
+    center = axes_meet(poses)
+    offsets = poses[:, :, 3] - center
+    height = offsets[:, 2].mean()
+    radius = offsets[:, :2].norm(dim=-1).mean()
+    start = torch.atan2(offsets[0, 1], offsets[0, 0])
+    angles = start + step * torch.arange(frames, dtype=poses.dtype)
+    positions = center + torch.stack(
+        [radius * torch.cos(angles), radius * torch.sin(angles), height.expand(frames)], dim=-1
+    )
+    back = torch.nn.functional.normalize(positions - center, dim=-1)
+    right = torch.nn.functional.normalize(torch.linalg.cross(back.new_tensor([[0.0, 0.0, 1.0]]), back), dim=-1)
+    return torch.stack([right, torch.linalg.cross(back, right), back, positions], dim=-1)
+
+
+def axes_meet(poses: Float[Tensor, "cameras 3 4"]) -> Float[Tensor, "3"]:
+    """The point with the smallest sum of squared distances to the cameras' optical axes."""
+    axes = poses[:, :, 2]
+    across = torch.eye(3, dtype=poses.dtype) - axes[:, :, None] * axes[:, None, :]
+    return torch.linalg.lstsq(across.sum(dim=0), (across @ poses[:, :, 3:]).sum(dim=0)).solution[:, 0]

@@ -1,0 +1,182 @@
+"""A grid that remembers how dense each part of the cube is, so that samples go where something is.
+
+In stage 1 it follows the field as it learns: a ray's samples are placed by the weights that the remembered densities
+give. Once the coarse field is frozen, it says which cells are empty.
+"""
+
+from typing import Callable, NamedTuple, Optional
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from sparsestyle_ns.core.sampling import even_edges, sample_pdf
+from sparsestyle_ns.core.spaces import Segments
+from sparsestyle_ns.core.volrend import dense_weights, optical_depth
+
+
+def interval_lengths(
+    segments: Segments, edges: Float[Tensor, "rays edges"], unbounded: bool
+) -> Float[Tensor, "rays samples"]:
+    """δ of each sample; the last is infinite in an unbounded space, as in NeRF, for rays that hit it."""
+    lengths = segments.lengths(edges)
+    if not unbounded:
+        return lengths
+    last = torch.where(segments.hit, torch.inf, 0.0)[:, None].to(lengths)
+    return torch.cat([lengths[:, :-1], last], dim=-1)
+
+
+def grid_cells(positions: Float[Tensor, "*batch 3"], resolution: int) -> Int[Tensor, "*batch 3"]:
+    """Indices of the cells of the cube [−1, 1]³ that positions lie in; outside of it the nearest cell's."""
+    # Cut off before they become integers, which have no numbers for the farthest points. What is no number gets the
+    # first cell: an index out of bounds would end the process on a GPU before anyone could say where it came from.
+    return ((0.5 * positions + 0.5) * resolution).clamp(0, resolution - 1).long().clamp_(min=0)
+
+
+class DensityGrid(nn.Module):
+    """σ per cell of the cube [−1, 1]³.
+
+    Args:
+        resolution: cells along a side.
+        initial: σ before anything is known.
+    """
+
+    density: Float[Tensor, "cells"]
+
+    def __init__(self, resolution: int, initial: float = 1.0) -> None:
+        super().__init__()
+        self.resolution = resolution
+        self.register_buffer("density", torch.full((resolution**3,), initial))
+
+    def cells(self, positions: Float[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
+        """The cell each position lies in; positions outside the cube belong to the nearest cell."""
+        index = grid_cells(positions, self.resolution)
+        return (index[..., 0] * self.resolution + index[..., 1]) * self.resolution + index[..., 2]
+
+    @torch.no_grad()
+    def remember(
+        self, positions: Float[Tensor, "*batch 3"], density: Float[Tensor, "*batch"], decay: float = 0.8
+    ) -> None:
+        """Takes note of densities seen at positions: the larger of them and `decay` times what the cell had.
+
+        A density that isn't finite is no news: the step it comes from is skipped, but what the grid holds would stay.
+        """
+        cells = self.cells(positions).reshape(-1)
+        seen = density.detach().reshape(-1).to(self.density)
+        self.density[cells] *= decay
+        self.density.scatter_reduce_(0, cells, seen.where(seen.isfinite(), 0.0), reduce="amax")
+
+    @torch.no_grad()
+    def place_samples(
+        self,
+        segments: Segments,
+        num_samples: int,
+        num_bins: int,
+        unbounded: bool,
+        even_share: float,
+        generator: Optional[torch.Generator] = None,
+    ) -> Float[Tensor, "rays edges"]:
+        """Borders of `num_samples` samples on each ray, dense where the remembered density is seen from the camera.
+
+        The histogram is what volume rendering of the remembered densities on `num_bins` even bins gives, each bin
+        widened to its neighbours, plus an even share so that no part of a ray is forgotten.
+
+        Args:
+            even_share: part of the mass in (0, 1] that is spread evenly.
+            generator: source of random numbers, or None for a fixed placement.
+        """
+        rays = len(segments.hit)
+        edges = even_edges(rays, num_bins, self.density.device, generator)
+        middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+        density = self.density[self.cells(segments.positions(middle))]
+        weights = dense_weights(optical_depth(density, interval_lengths(segments, edges, unbounded)))
+        weights = F.max_pool1d(weights[:, None], kernel_size=3, stride=1, padding=1)[:, 0]
+        share = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-6)
+        return sample_pdf(edges, (1.0 - even_share) * share + even_share / num_bins, num_samples, generator)
+
+
+class Occupancy(nn.Module):
+    """Which cells of the cube hold anything of a frozen field.
+
+    Args:
+        resolution: cells along a side.
+    """
+
+    occupied: Bool[Tensor, "x y z"]
+
+    def __init__(self, resolution: int) -> None:
+        super().__init__()
+        self.resolution = resolution
+        self.register_buffer("occupied", torch.ones(resolution, resolution, resolution, dtype=torch.bool))
+
+    @property
+    def share(self) -> float:
+        """Share of the cells that are occupied, in [0, 1]."""
+        return self.occupied.float().mean().item()
+
+    @torch.no_grad()
+    def measure(
+        self, density: Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]], min_alpha: float, chunk: int
+    ) -> None:
+        """Marks the cells in which a ray would meet an opacity of at least `min_alpha`, and their neighbours.
+
+        Args:
+            density: σ at field coordinates.
+            min_alpha: smallest 1 − exp(−σ · cell side), at the cell's centre, that counts.
+            chunk: points a call of `density`.
+        """
+        side = 2.0 / self.resolution
+        axis = (torch.arange(self.resolution, device=self.occupied.device) + 0.5) * side - 1.0
+        alphas = []
+        layers = max(1, chunk // self.resolution**2)
+        for xs in axis.split(layers):
+            points = torch.stack(torch.meshgrid(xs, axis, axis, indexing="ij"), dim=-1)
+            alphas.append(-torch.expm1(-density(points.reshape(-1, 3)) * side).view(points.shape[:-1]))
+        occupied = (torch.cat(alphas) > min_alpha).to(torch.uint8)
+        self.occupied.copy_(F.max_pool3d(occupied.float()[None], kernel_size=3, stride=1, padding=1)[0] > 0)
+
+    def contains(self, positions: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
+        """Whether positions lie in occupied cells; positions outside the cube belong to the nearest cell."""
+        index = grid_cells(positions, self.resolution)
+        return self.occupied[index[..., 0], index[..., 1], index[..., 2]]
+
+
+class PackedSamples(NamedTuple):
+    """Samples of a batch of rays in the packed layout (see `compositing`).
+
+    Attributes:
+        ray_indices: the ray each sample lies on, ascending; front to back on a ray.
+        s: middle of its interval, in [0, 1].
+        lengths: δ in field coordinates; infinite for the last interval of an unbounded space.
+        positions: field coordinates of the middle.
+    """
+
+    ray_indices: Int[Tensor, "samples"]
+    s: Float[Tensor, "samples"]
+    lengths: Float[Tensor, "samples"]
+    positions: Float[Tensor, "samples 3"]
+
+    def select(self, keep: Tensor) -> "PackedSamples":
+        """Some of the samples, in order, by mask or ascending indices."""
+        return PackedSamples(*(part[keep] for part in self))
+
+
+@torch.no_grad()
+def march(segments: Segments, occupancy: Optional[Occupancy], num_steps: int, unbounded: bool) -> PackedSamples:
+    """The samples of `num_steps` even steps along each ray that lie in occupied cells; all without an `occupancy`.
+
+    In an unbounded space the last step is always kept: its interval goes on to infinity.
+    """
+    edges = even_edges(len(segments.hit), num_steps, segments.hit.device)
+    middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+    positions = segments.positions(middle)
+    keep = segments.hit[:, None].expand(-1, num_steps)
+    if occupancy is not None:
+        filled = occupancy.contains(positions)
+        if unbounded:
+            filled[:, -1] = True
+        keep = keep & filled
+    ray_indices, step = keep.nonzero(as_tuple=True)
+    lengths = interval_lengths(segments, edges, unbounded)
+    return PackedSamples(ray_indices, middle[keep], lengths[ray_indices, step], positions[keep])

@@ -1,0 +1,312 @@
+"""Which part of space a scene lies in, and how it is laid into the cube [−1, 1]³ that the fields live in.
+
+Three spaces cover the scenes that nerfstudio's dataparsers give: *forward-facing* (NDC: everything from a near plane to
+infinity), *box* (an object in an axis-aligned box) and *contracted* (cameras all around, background at any distance).
+A space turns rays into segments; s in [0, 1] goes from a segment's start to its end. Density is per unit of length in
+the cube, so that the scale of the world's coordinates doesn't matter.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Optional, Tuple, Union
+
+import torch
+from jaxtyping import Bool, Float, Int
+from nerfstudio.data.scene_box import SceneBox
+from torch import Tensor, nn
+
+from sparsestyle_ns.core.ndc import ndc_distance, ndc_parameter, ndc_rays
+
+MAX_DISTANCE = 1e4
+"""The distance that stands for infinity in depth maps, in units of the scene: of the near plane's distance in a
+forward-facing space, of the contraction's unit in a contracted one."""
+
+
+class Segments(ABC):
+    """The parts of a batch of rays that lie in the scene. Rays that miss it have length 0 and `hit` false."""
+
+    hit: Bool[Tensor, "rays"]
+
+    @abstractmethod
+    def positions(
+        self, s: Float[Tensor, "..."], ray_indices: Optional[Int[Tensor, "samples"]] = None
+    ) -> Float[Tensor, "... 3"]:
+        """Field coordinates at s: [rays, samples] on all rays, or [samples] on the rays `ray_indices`."""
+
+    @abstractmethod
+    def lengths(self, edges: Float[Tensor, "rays edges"]) -> Float[Tensor, "rays samples"]:
+        """Length in field coordinates between neighbouring borders."""
+
+    @abstractmethod
+    def distance(self, s: Float[Tensor, "rays 1"]) -> Float[Tensor, "rays 1"]:
+        """Distance from the ray's origin in world units, at most `MAX_DISTANCE` of the scene's."""
+
+    @abstractmethod
+    def at_distance(self, distance: Float[Tensor, "rays 1"]) -> Float[Tensor, "rays 1"]:
+        """s at a distance from the ray's origin in world units: the inverse of `distance`, cut to [0, 1]."""
+
+
+@dataclass
+class LinearSegments(Segments):
+    """Segments that are straight in field coordinates: start + s · extent."""
+
+    start: Float[Tensor, "rays 3"]
+    extent: Float[Tensor, "rays 3"]
+    hit: Bool[Tensor, "rays"]
+
+    def positions(self, s: Tensor, ray_indices: Optional[Tensor] = None) -> Tensor:
+        """See `Segments.positions`."""
+        if ray_indices is None:
+            return self.start[:, None] + s[..., None] * self.extent[:, None]
+        return self.start[ray_indices] + s[:, None] * self.extent[ray_indices]
+
+    def lengths(self, edges: Tensor) -> Tensor:
+        """See `Segments.lengths`."""
+        return (edges[:, 1:] - edges[:, :-1]) * self.extent.norm(dim=-1, keepdim=True)
+
+
+@dataclass
+class ForwardFacingSegments(LinearSegments):
+    """Linear segments in NDC, with the world rays they came from; t' runs from `first` to `last`."""
+
+    origins: Float[Tensor, "rays 3"]
+    directions: Float[Tensor, "rays 3"]
+    near: float
+    first: float
+    last: float
+
+    def distance(self, s: Tensor) -> Tensor:
+        """See `Segments.distance`."""
+        t_ndc = self.first + s * (self.last - self.first)
+        return ndc_distance(t_ndc, self.origins, self.directions, self.near, max_distance=MAX_DISTANCE * self.near)
+
+    def at_distance(self, distance: Tensor) -> Tensor:
+        """See `Segments.at_distance`."""
+        t_ndc = ndc_parameter(distance, self.origins, self.directions, self.near)
+        return _position_between(t_ndc, self.first, self.last)
+
+
+@dataclass
+class BoxSegments(LinearSegments):
+    """Linear segments in a box, entered at distance `near` and left at `far`; `beyond` is behind all of the box."""
+
+    near: Float[Tensor, "rays 1"]
+    far: Float[Tensor, "rays 1"]
+    beyond: Float[Tensor, "rays 1"]
+
+    def distance(self, s: Tensor) -> Tensor:
+        """See `Segments.distance`; a ray that misses the box sees what is beyond it."""
+        return torch.where(self.hit[:, None], self.near + s * (self.far - self.near), self.beyond)
+
+    def at_distance(self, distance: Tensor) -> Tensor:
+        """See `Segments.at_distance`."""
+        return _position_between(distance, self.near, self.far)
+
+
+@dataclass
+class ContractedSegments(Segments):
+    """Segments of world rays, bent by the contraction; s is linear up to distance 1 and in disparity beyond.
+
+    Origins and `near` are in multiples of `unit`, a length in the world.
+    """
+
+    origins: Float[Tensor, "rays 3"]
+    directions: Float[Tensor, "rays 3"]
+    near: float
+    unit: float
+    hit: Bool[Tensor, "rays"]
+
+    def distance(self, s: Tensor) -> Tensor:
+        """See `Segments.distance`."""
+        return self.unit * self._distance_in_units(s)
+
+    def _distance_in_units(self, s: Tensor) -> Tensor:
+        start, end = self._ends
+        return inverse_spacing(start.to(s) + s * (end - start).to(s))
+
+    @property
+    def _ends(self) -> Tuple[Tensor, Tensor]:
+        return spacing(torch.tensor(self.near)), spacing(torch.tensor(MAX_DISTANCE))
+
+    def at_distance(self, distance: Tensor) -> Tensor:
+        """See `Segments.at_distance`."""
+        return _position_between(spacing(distance / self.unit), *(end.to(distance) for end in self._ends))
+
+    def positions(self, s: Tensor, ray_indices: Optional[Tensor] = None) -> Tensor:
+        """See `Segments.positions`."""
+        if ray_indices is None:
+            points = self.origins[:, None] + self._distance_in_units(s)[..., None] * self.directions[:, None]
+        else:
+            points = self.origins[ray_indices] + self._distance_in_units(s)[:, None] * self.directions[ray_indices]
+        return contract(points)
+
+    def lengths(self, edges: Tensor) -> Tensor:
+        """See `Segments.lengths`; chords of the bent ray."""
+        points = self.positions(edges)
+        return (points[:, 1:] - points[:, :-1]).norm(dim=-1)
+
+
+def _position_between(value: Tensor, first: Union[float, Tensor], last: Union[float, Tensor]) -> Tensor:
+    """Where a value lies between two, in [0, 1]; 0 where they are equal."""
+    length = torch.as_tensor(last - first).to(value)
+    return torch.where(length > 0, (value - first) / torch.where(length > 0, length, 1.0), 0.0).clamp(0.0, 1.0)
+
+
+def spacing(distance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """g(t) = t/2 up to t = 1, then 1 − 1/(2t): even steps in g are even in distance near by, in disparity far away."""
+    return torch.where(distance < 1.0, 0.5 * distance, 1.0 - 0.5 / distance.clamp(min=1.0))
+
+
+def inverse_spacing(spaced: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The inverse of `spacing`, at most `MAX_DISTANCE`."""
+    return torch.where(spaced < 0.5, 2.0 * spaced, 0.5 / (1.0 - spaced).clamp(min=0.5 / MAX_DISTANCE))
+
+
+def contract(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Points into [−1, 1]³: x/2 within the unit cube, (1 − 1/(2|x|)) x/|x| outside, |·| the largest coordinate.
+
+    It is the contraction of mip-NeRF 360 (Eq. 10) with the maximum norm, halved.
+    """
+    norm = points.abs().amax(dim=-1, keepdim=True).clamp(min=1.0)
+    # Equal to x/2 at norm 1, and so everywhere within the cube. x/|x| comes first: the largest x has no double.
+    return (1.0 - 0.5 / norm) * (points / norm)
+
+
+def intersect_box(
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    minimum: Float[Tensor, "3"],
+    maximum: Float[Tensor, "3"],
+    near: Union[float, Float[Tensor, ""]] = 0.0,
+) -> Tuple[Float[Tensor, "rays 1"], Float[Tensor, "rays 1"], Bool[Tensor, "rays"]]:
+    """Distances at which rays enter and leave an axis-aligned box (the slab method).
+
+    Args:
+        near: rays start no closer than this, so that a camera may stand in the box.
+
+    Returns:
+        Entry and exit distance, and whether the ray meets the box. Where it doesn't, both distances are `near`.
+    """
+    tiny = torch.finfo(directions.dtype).tiny
+    safe = torch.where(directions.abs() < tiny, torch.full_like(directions, tiny), directions)
+    to_minimum, to_maximum = (minimum - origins) / safe, (maximum - origins) / safe
+    entry = torch.minimum(to_minimum, to_maximum).amax(dim=-1, keepdim=True).clamp(min=near)
+    leave = torch.maximum(to_minimum, to_maximum).amin(dim=-1, keepdim=True)
+    hit = leave > entry
+    return torch.where(hit, entry, near), torch.where(hit, leave, near), hit.squeeze(-1)
+
+
+class Space(nn.Module, ABC):
+    """A map from world rays to segments in field coordinates."""
+
+    unbounded: bool
+    """Whether a segment's last interval goes on to infinity."""
+
+    @abstractmethod
+    def segments(self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]) -> Segments:
+        """The parts of world rays (unit directions) that lie in the scene."""
+
+
+class ForwardFacingSpace(Space):
+    """Normalised device coordinates (NeRF, appendix C), for cameras that all look one way.
+
+    Depth d lies at z' = 1 − 2 near/d. Samples lie between the two depths of `depth_range`; the last one's interval goes
+    on to infinity. Knowing how far away the farthest thing is matters with few photos: all that lies at infinity looks
+    the same from everywhere, so that a field which puts a whole photo there is hard to dislodge.
+
+    Args:
+        box: NDC box that holds all views' frusta; between the depths it becomes the cube.
+        focal_over_half_size: 2f/width and 2f/height.
+        near: distance of the near plane in world units.
+        depth_range: depth of the nearest and of the farthest thing, in world units; None for all from `near` on.
+    """
+
+    unbounded = True
+
+    def __init__(
+        self,
+        box: SceneBox,
+        focal_over_half_size: Tuple[float, float],
+        near: float,
+        depth_range: Optional[Tuple[float, float]] = None,
+    ) -> None:
+        super().__init__()
+        nearest, farthest = depth_range or (near, math.inf)
+        self.first, self.last = 1.0 - near / max(near, nearest), 1.0 - near / farthest
+        minimum, maximum = box.aabb.float().clone()
+        minimum[2], maximum[2] = 2.0 * self.first - 1.0, 2.0 * self.last - 1.0
+        self.register_buffer("minimum", minimum)
+        self.register_buffer("maximum", maximum)
+        self.focal_over_half_size = focal_over_half_size
+        self.near = near
+
+    def segments(self, origins: Tensor, directions: Tensor) -> ForwardFacingSegments:
+        """See `Space.segments`."""
+        start, extent, valid = ndc_rays(origins, directions, self.focal_over_half_size, self.near)
+        hit = valid.squeeze(-1)
+        size = self.maximum - self.minimum
+        scale = 2.0 / torch.where(size > 0, size, 2.0)
+        return ForwardFacingSegments(
+            start=(start + self.first * extent - self.minimum) * scale - 1.0,
+            extent=(self.last - self.first) * extent * scale * hit[:, None],
+            hit=hit,
+            origins=origins,
+            directions=directions,
+            near=self.near,
+            first=self.first,
+            last=self.last,
+        )
+
+
+class BoxSpace(Space):
+    """An axis-aligned box in world coordinates, for an object with nothing behind it.
+
+    Args:
+        box: the box; its longest side becomes the cube's.
+        near: rays start no closer to the camera than this, in half sides of the cube.
+    """
+
+    unbounded = False
+
+    def __init__(self, box: SceneBox, near: float = 1 / 30) -> None:
+        super().__init__()
+        self.register_buffer("minimum", box.aabb[0].float().clone())
+        self.register_buffer("maximum", box.aabb[1].float().clone())
+        self.near = near
+
+    def segments(self, origins: Tensor, directions: Tensor) -> BoxSegments:
+        """See `Space.segments`."""
+        center = 0.5 * (self.minimum + self.maximum)
+        size = self.maximum - self.minimum
+        scale = 2.0 / size.amax()
+        near, far, hit = intersect_box(origins, directions, self.minimum, self.maximum, self.near / scale)
+        return BoxSegments(
+            start=(origins + near * directions - center) * scale,
+            extent=(far - near) * directions * scale,
+            hit=hit,
+            near=near,
+            far=far,
+            beyond=(origins - center).norm(dim=-1, keepdim=True) + 0.5 * size.norm(),
+        )
+
+
+class ContractedSpace(Space):
+    """All of space, contracted, for cameras all around and a background beyond them.
+
+    Args:
+        unit: the length in the world, above 0, that the contraction takes as 1: coordinates below it aren't bent.
+        near: distance at which rays start, in that unit.
+    """
+
+    unbounded = True
+
+    def __init__(self, unit: float = 1.0, near: float = 0.05) -> None:
+        super().__init__()
+        self.unit = unit
+        self.near = near
+
+    def segments(self, origins: Tensor, directions: Tensor) -> ContractedSegments:
+        """See `Space.segments`."""
+        hit = torch.ones(len(origins), dtype=torch.bool, device=origins.device)
+        return ContractedSegments(origins / self.unit, directions, self.near, self.unit, hit)

@@ -1,0 +1,162 @@
+"""Photos of a scene: one that can't be trained on is found when it is read, and named."""
+
+import copy
+from collections import Counter
+from pathlib import Path
+from typing import Any, Dict, Literal, Sequence, Tuple
+
+import numpy as np
+from jaxtyping import Int, UInt8
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from PIL import Image
+from torch import Tensor
+
+from sparsestyle_ns.utils.errors import InputError
+
+IMAGE_MODES = ("L", "RGB", "RGBA")
+"""Pillow's names of the pixel formats that are read as they are meant."""
+SMALLEST_SIDE = 8
+"""Pixels a side below which a photo shows nothing."""
+DARKEST = 3
+"""Of 255: a photo with nothing brighter is black, but for the noise of its compression."""
+
+
+def open_photo(path: Path, draft: bool = False) -> Image.Image:
+    """Reads a photo whole.
+
+    Args:
+        path: the image file.
+        draft: whether a JPEG may come at its smallest size, which is fast and still finds that it is cut short.
+
+    Raises:
+        InputError: there is no such file, it can't be decoded, or its pixels aren't 8-bit grey, RGB or RGBA.
+    """
+    try:
+        with Image.open(path) as image:
+            if draft:
+                image.draft(None, (1, 1))
+            image.load()
+    except FileNotFoundError as error:
+        raise InputError(f"There is no photo {path}: put it there, or take it out of the scene.") from error
+    # Decoders meet a damaged file with errors of many kinds: OSError, SyntaxError, struct.error, and others.
+    except Exception as error:
+        raise InputError(f"{path} cannot be read as an image, it may be cut short: replace it.") from error
+    if image.mode not in IMAGE_MODES:
+        raise InputError(
+            f"{path} has pixels of the kind {image.mode}{_count_broken(image)}: save it as 8-bit RGB or RGBA."
+        )
+    return image
+
+
+def _count_broken(image: Image.Image) -> str:
+    """What to add about pixels that aren't finite, which only floating-point images can have."""
+    count = int((~np.isfinite(np.asarray(image))).sum()) if image.mode == "F" else 0
+    return f", {count} of which are not finite" * (count > 0)
+
+
+def photo_size(path: Path) -> Tuple[int, int]:
+    """Width and height in pixels, from the file's header alone.
+
+    Raises:
+        InputError: there is no such file, or it has no such header.
+    """
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except Exception:
+        return open_photo(path).size  # says what is wrong with it
+
+
+def check_one_size(filenames: Sequence[Path]) -> None:
+    """Makes sure that photos are of one size.
+
+    Raises:
+        InputError: one isn't of the size that most are of; it is named.
+    """
+    sizes = {filename: photo_size(filename) for filename in filenames}
+    usual = Counter(sizes.values()).most_common(1)[0][0]
+    for filename, size in sizes.items():
+        if size != usual:
+            raise InputError(
+                f"{filename} is {size[0]}x{size[1]} pixels, but the other images are {usual[0]}x{usual[1]}: bring all "
+                "of them to one size."
+            )
+
+
+def at_size(cameras: Cameras, width: Int[Tensor, "views 1"], height: Int[Tensor, "views 1"]) -> Cameras:
+    """The same cameras for images of another size: each pixel's ray goes to what that pixel shows.
+
+    nerfstudio multiplies focal lengths and centres by the scale that was asked for, also where whole pixels make the
+    image's own another one: of 378 rows times 1/4, 94 are left, whose last ones then are half a pixel off.
+    """
+    resized = copy.deepcopy(cameras)
+    across, down = width / cameras.width, height / cameras.height
+    resized.fx, resized.cx, resized.width = cameras.fx * across, cameras.cx * across, width
+    resized.fy, resized.cy, resized.height = cameras.fy * down, cameras.cy * down, height
+    return resized
+
+
+def check_content(path: Path, pixels: UInt8[np.ndarray, "H W channels"]) -> None:
+    """Makes sure that a photo shows something.
+
+    Raises:
+        InputError: it is transparent all over, or black, or smaller than anything can be seen in.
+    """
+    height, width, channels = pixels.shape
+    if min(height, width) < SMALLEST_SIDE:
+        raise InputError(
+            f"{path} is {width}x{height} pixels, but at least {SMALLEST_SIDE} a side are needed: replace it, or choose "
+            "other views with --view-ids."
+        )
+    opaque = channels == 3 or pixels[..., 3].min() == 255
+    if not opaque and pixels[..., 3].max() == 0:
+        kind = "transparent"
+    elif opaque and pixels[..., :3].max() <= DARKEST:
+        kind = "black"
+    else:
+        return
+    raise InputError(f"{path} is {kind} all over: replace it, or choose other views with --view-ids.")
+
+
+class PhotoDataset(InputDataset):
+    """nerfstudio's dataset of images, which raises an `InputError` for those that can't be used."""
+
+    def get_numpy_image(self, image_idx: int) -> UInt8[np.ndarray, "H W channels"]:
+        """Pixels of a photo, [H, W, 3 or 4], at the size of its camera.
+
+        Raises:
+            InputError: it can't be read, is not of its camera's size, or shows nothing.
+        """
+        path = self.image_filenames[image_idx]
+        image = open_photo(path)
+        if image.mode == "L":
+            image = image.convert("RGB")
+        check_content(path, np.asarray(image))
+        size = int(self.cameras.width[image_idx]), int(self.cameras.height[image_idx])
+        # Products of sides and scales may fall to either side of a whole number.
+        if any(abs(own * self.scale_factor - side) > 1 for own, side in zip(image.size, size, strict=True)):
+            whole = tuple(round(side / self.scale_factor) for side in size)
+            raise InputError(
+                f"{path} is {image.width}x{image.height} pixels, but its camera is for {whole[0]}x{whole[1]}: scale it "
+                "to that size."
+            )
+        return np.array(image if image.size == size else image.resize(size, resample=Image.Resampling.BILINEAR))
+
+    def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> Dict[str, Any]:
+        """nerfstudio's dictionary of a photo and, where there is one, its mask.
+
+        Raises:
+            InputError: the photo or the mask can't be used.
+        """
+        try:
+            return super().get_data(image_idx, image_type)
+        except InputError:
+            raise
+        except Exception as error:  # nerfstudio's reader of masks names neither the file nor what is wrong
+            if self._dataparser_outputs.mask_filenames is None:
+                raise
+            mask = self._dataparser_outputs.mask_filenames[image_idx]
+            raise InputError(
+                f"The mask {mask} doesn't fit {self.image_filenames[image_idx]} or can't be read: replace it."
+            ) from error

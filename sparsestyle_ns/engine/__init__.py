@@ -1,0 +1,1 @@
+"""Training: the trainer, one step, one checkpoint writer, restyling, previews, and what to type next."""

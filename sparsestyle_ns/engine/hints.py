@@ -1,0 +1,163 @@
+"""The last line of this package's commands: what was made, and what to type next."""
+
+import shlex
+import sys
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, List, Optional, Sequence, Union
+
+from sparsestyle_ns.utils.progress import say
+
+PAINTING = "PAINTING.jpg"
+"""Stands for a painting that the person at the keyboard has to name."""
+RESUMING = ("--load-dir", "--load-checkpoint", "--load-step")
+"""Flags that say where training goes on."""
+
+
+def finish(made: Union[Path, str, None], command: Sequence[object]) -> None:
+    """Prints the last line of a command.
+
+    Args:
+        made: the file or folder that it made, with a word on it where that helps; None: nothing.
+        command: what to type next, in parts.
+    """
+    say(f"{'Nothing was saved' if made is None else f'Made {made}'} – next: {shlex.join(map(str, command))}")
+
+
+def ns_train_style(coarse_run: Path, config: Any, painting: Union[Path, str] = PAINTING) -> List[str]:
+    """The command that stylises a coarse run.
+
+    Args:
+        coarse_run: its folder.
+        config: its trainer's config.
+        painting: the style image.
+    """
+    method = config.method_name.replace("coarse-fewshot", "hier-style")
+    start = ["ns-train", method, "--style-image", str(painting), "--coarse-run", str(coarse_run)]
+    return [*start, *scene_arguments(config, method)]
+
+
+def after_evaluation(run: Path, stylised: bool) -> List[str]:
+    """What follows on the measuring of a run, stylised or coarse, given by its folder."""
+    from sparsestyle_ns.runs.coarse_run import read_coarse_run
+
+    return ["sparsestyle", "gallery", str(run)] if stylised else ns_train_style(run, read_coarse_run(run).config)
+
+
+def after_effects(
+    dataparser: str,
+    data: Path,
+    num_views: Optional[int],
+    view_ids: Optional[Sequence[int]],
+    coarse_run: Optional[Path],
+    style_image: Optional[Path],
+) -> List[str]:
+    """What follows on `sparsestyle effects`, from its arguments."""
+    command = ["ns-train", "coarse-fewshot"]
+    if coarse_run is not None:
+        painting = PAINTING if style_image is None else str(style_image)
+        command = ["ns-train", "hier-style", "--style-image", painting, "--coarse-run", str(coarse_run)]
+    command += _flag("--num-views", num_views, None) + _flag("--view-ids", view_ids, None)
+    return [*command, "--data", str(data), dataparser]
+
+
+def after_tradeoff(options: Any) -> List[str]:
+    """What follows on `sparsestyle tradeoff`: training with the preset it started from.
+
+    Args:
+        options: what the command line said.
+    """
+    command = ["ns-train", "coarse-fewshot" if options.full else "coarse-fewshot-draft"]
+    for name in ("max_image_side", "num_views", "view_ids"):
+        command += _flag(f"--{name}", getattr(options, name), None)
+    return [*command, "--data", str(options.data), *_parser(options.dataparser)]
+
+
+def study_arguments(options: Any) -> List[object]:
+    """The arguments by which the one kind of study is run on the runs of the other.
+
+    Args:
+        options: a `StudyOptions`; the page is named after the ablations.
+    """
+    page = options.output_path.with_name("ablate.html")
+    start = ["--data", options.data, "--style-images", *options.style_images, "--output-path", page]
+    for each in fields(options):
+        if each.name not in ("data", "style_images", "output_path"):
+            value = getattr(options, each.name)
+            if value is True:
+                start.append(f"--{each.name}")
+            elif value != each.default:
+                start.append(f"--{each.name.replace('_', '-')}={value}")
+    return start
+
+
+def after_export(run: Path, output_path: Path, format: str) -> List[object]:
+    """What follows on an export: a look at a page; of a file of points or triangles, that page."""
+    if format == "html":
+        return ["python", "-m", "webbrowser", output_path.resolve().as_uri()]
+    return ["sparsestyle", "export", run, "--format", "html", "--output-path", output_path.with_suffix(".html")]
+
+
+def scene_arguments(config: Any, method: str) -> List[str]:
+    """The end of an ns-train command on the same scene, with the same views and effects.
+
+    Args:
+        config: the config of a run of either method.
+        method: the name of the method that is to be trained.
+    """
+    from sparsestyle_ns.method_configs import method_config
+
+    default, manager = method_config(method), config.pipeline.datamanager
+    arguments: List[str] = []
+    for name in ("num_views", "view_ids", "max_image_side"):
+        arguments += _flag(f"--{name}", getattr(manager, name), getattr(default.pipeline.datamanager, name))
+    arguments += changed_flags(config.pipeline.effects, default.pipeline.effects, "pipeline.effects.")
+    for name in ("output_dir", "vis"):
+        arguments += _flag(f"--{name}", getattr(config, name), getattr(default, name))
+    return [*arguments, "--data", str(manager.data or manager.dataparser.data), *_parser(manager.dataparser)]
+
+
+def _parser(config: Any) -> List[str]:
+    """A dataparser's name and those of its settings that aren't its defaults."""
+    from nerfstudio.configs.dataparser_configs import all_dataparsers
+
+    name = next(name for name, known in all_dataparsers.items() if type(known) is type(config))
+    return [name, *changed_flags(config, all_dataparsers[name])]
+
+
+def changed_flags(config: Any, default: Any, prefix: str = "") -> List[str]:
+    """The flags by which a config differs from a default of the same class; its `data` is named elsewhere."""
+    flags: List[str] = []
+    for each in fields(config):
+        value, usual = getattr(config, each.name), getattr(default, each.name)
+        if each.name not in ("data", "_target") and not is_dataclass(value):
+            flags += _flag(f"--{prefix}{each.name}", value, usual)
+    return flags
+
+
+def _flag(name: str, value: Any, usual: Any) -> List[str]:
+    if value == usual:
+        return []
+    values = value if isinstance(value, (tuple, list)) else (value,)
+    return [name.replace("_", "-"), *map(str, values)]
+
+
+def resume_command(method: str, checkpoints: Path, typed: Optional[Sequence[str]] = None) -> List[str]:
+    """The command that was typed, going on from the checkpoints in a folder.
+
+    Args:
+        method: what was trained.
+        checkpoints: the folder.
+        typed: the arguments of this process; None: its own.
+    """
+    typed = sys.argv[1:] if typed is None else list(typed)
+    if method not in typed:  # training was begun by something else than ns-train
+        return ["ns-train", method, "--load-dir", str(checkpoints)]
+    before, after = typed[: typed.index(method)], typed[typed.index(method) + 1 :]
+    kept, skip = [], False
+    for argument in after:
+        is_resuming = argument.split("=")[0].replace("_", "-") in RESUMING
+        if not skip and not is_resuming:
+            kept.append(argument)
+        skip = is_resuming and "=" not in argument
+    return ["ns-train", *before, method, "--load-dir", str(checkpoints), *kept]

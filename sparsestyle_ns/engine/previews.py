@@ -1,0 +1,72 @@
+"""What a run looks like while it is trained: one held-out view, the same each time, beside its photo."""
+
+import io
+from pathlib import Path
+from typing import FrozenSet, Sequence
+
+import torch
+from jaxtyping import Float
+from nerfstudio.utils.writer import to8b
+from PIL import Image
+from torch import Tensor
+
+from sparsestyle_ns.evaluation.held_out import exact_outputs
+from sparsestyle_ns.pipelines.base import CheckedPipeline
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import write_whole
+
+FOLDER = "previews"
+"""In a run's folder."""
+
+
+def preview_steps(shares: Sequence[float], total: int) -> FrozenSet[int]:
+    """The numbers of iterations after which a preview is due.
+
+    Args:
+        shares: of all iterations, in (0, 1].
+        total: all iterations.
+
+    Raises:
+        InputError: a share isn't in that range.
+    """
+    for share in shares:
+        if not 0.0 < share <= 1.0:
+            raise InputError(f"--previews has {share:g}, which isn't a share of the iterations above 0 and up to 1.")
+    return frozenset(max(1, round(share * total)) for share in shares)
+
+
+@torch.no_grad()
+def render_preview(pipeline: CheckedPipeline, longest_side: int) -> Float[Tensor, "H W 3"]:
+    """The middle one of the held-out views: photo, unstylised render where there is one, and render, side by side.
+
+    Rendered exactly, and without leaving a trace in the state of training.
+
+    Args:
+        pipeline: of either method.
+        longest_side: pixels of the view's longer side, at most.
+    """
+    model, dataset = pipeline.model, pipeline.datamanager.eval_dataset
+    index = len(dataset) // 2
+    camera = dataset.cameras[index : index + 1].to(model.device)
+    photo = dataset[index]["image"][..., :3].to(model.device)
+    scale = longest_side / max(photo.shape[:2])
+    if scale < 1.0:
+        camera.rescale_output_resolution(scale)
+    size = int(camera.height), int(camera.width)
+    photo = torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
+    pipeline.eval()
+    outputs = exact_outputs(model, camera)
+    pipeline.train()
+    renders = [outputs[name] for name in ("rgb_coarse", "rgb") if name in outputs]
+    return torch.cat([photo, *renders], dim=1)
+
+
+def save_preview(picture: Float[Tensor, "H W 3"], run: Path, iterations: int) -> Path:
+    """Writes a preview into a run's folder; returns the file.
+
+    Raises:
+        OSError: it can't be written.
+    """
+    buffer = io.BytesIO()
+    Image.fromarray(to8b(picture).cpu().numpy()).save(buffer, "PNG")
+    return write_whole(run / FOLDER / f"after-{iterations:06d}.png", buffer.getvalue())

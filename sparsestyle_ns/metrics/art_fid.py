@@ -1,0 +1,178 @@
+"""ArtFID: (1 + LPIPS) · (1 + FID), low where content is kept and the style is near (Wright and Ommer 2022, Eq. 1).
+
+LPIPS is between each stylised picture and its content; FID between stylised pictures and paintings, in the features of
+an Inception-v3 that was trained on art. The weights of neither network are part of this package, and nothing downloads
+them: ArtFID is measured where both files are in the torch hub cache, and left out elsewhere.
+
+Its authors compare thousands of pictures with as many paintings. A scene has a few views and one painting, so here the
+sample is squares: all pictures, and the painting, are enlarged or reduced until their shorter side has `SHORTER_SIDE`
+pixels, and cut into overlapping squares of the side that the network was made for. Figures depend on that choice, and
+so do covariances of so few squares: they rank rows that are measured alike, and can't be set beside others' ArtFID.
+"""
+
+import functools
+import math
+from pathlib import Path
+from typing import Any, Dict, List, Optional
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sparsestyle_ns.metrics.image import ALEXNET_FILE, hub_folder, lpips_metric
+from sparsestyle_ns.utils.errors import InputError
+
+ART_INCEPTION_FILE = "art_inception.pth"
+HEADS = ("fc1.", "fc2.", "AuxLogits1.", "AuxLogits2.")
+"""Classifiers in that file, which the features don't need."""
+SQUARE = 299
+"""Side of the squares, in pixels: that of the pictures that Inception-v3 was made for."""
+SHORTER_SIDE = 448
+"""Shorter side, in pixels, of the pictures that they are cut from: one and a half squares."""
+STEP = 75
+"""Pixels from one square to the next, at most."""
+
+
+def frechet_distance(first: Float[Tensor, "n C"], second: Float[Tensor, "m C"]) -> float:
+    """FID of two samples of features: |μ − μ'|² + tr Σ + tr Σ' − 2 tr (Σ Σ')^½ (Heusel et al. 2017, Eq. 6).
+
+    With X and X' the centred samples over √(n − 1) and √(m − 1), Σ = XᵀX and Σ' = X'ᵀX', the eigenvalues of Σ Σ' other
+    than 0 are those of (X X'ᵀ)(X X'ᵀ)ᵀ. So the last trace is the sum of the singular values of X X'ᵀ, a matrix of n × m
+    numbers, however singular the covariances are. A sample of one has the covariance 0.
+
+    Args:
+        first, second: one vector a row, one or more each.
+
+    Returns:
+        0 or more, in units of the features squared; 0 for samples of equal mean and covariance.
+    """
+    samples = [sample.double() for sample in (first, second)]
+    means = [sample.mean(dim=0) for sample in samples]
+    x, y = ((sample - mean) / math.sqrt(max(1, len(sample) - 1)) for sample, mean in zip(samples, means, strict=True))
+    shared = torch.linalg.svdvals(x @ y.T).sum()
+    distance = (means[0] - means[1]).square().sum() + x.square().sum() + y.square().sum() - 2.0 * shared
+    return max(0.0, float(distance))
+
+
+def resized(picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
+    """A picture in [0, 1] with a shorter side of `SHORTER_SIDE` pixels (bilinear, antialiased), on the CPU."""
+    scale = SHORTER_SIDE / min(picture.shape[:2])
+    size = [round(scale * length) for length in picture.shape[:2]]
+    batch = picture.detach().clamp(0.0, 1.0).cpu().permute(2, 0, 1)[None]
+    return F.interpolate(batch, size=size, mode="bilinear", antialias=True, align_corners=False).clamp(0.0, 1.0)
+
+
+def squares(picture: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "squares 3 side side"]:
+    """Overlapping squares of `SQUARE` pixels from border to border, at even steps of `STEP` pixels at most."""
+    tops, lefts = (
+        torch.linspace(0, room, 1 + math.ceil(room / STEP)).round().long().tolist()
+        for room in (length - SQUARE for length in picture.shape[2:])
+    )
+    return torch.cat([picture[..., top : top + SQUARE, left : left + SQUARE] for top in tops for left in lefts])
+
+
+def load_art_inception(path: Path) -> nn.Module:
+    """The Inception-v3 of a file as ArtFID's authors publish it; pictures in [0, 1] in, 2048 features a picture out.
+
+    The file is a state dict of torchvision's Inception-v3 with two heads and two auxiliary ones (`HEADS`) in place of
+    torchvision's. As in the authors' code, colours go in as they are, and the features are the pooled ones before the
+    heads.
+
+    Raises:
+        InputError: the file can't be read, or is of another network.
+    """
+    from torchvision.models import inception_v3
+
+    with torch.device("meta"):  # the weights come from the file, and torch's random state stays untouched
+        network = inception_v3(weights=None, aux_logits=False, init_weights=False, transform_input=False)
+    network.fc = nn.Identity()
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a file that is no checkpoint can fail in many ways
+        raise _not_art_inception(path, "it can't be read") from error
+    if not isinstance(state, dict):
+        raise _not_art_inception(path, "it holds no state dict")
+    expected = network.state_dict()
+    for name in state:
+        if name not in expected and not str(name).startswith(HEADS):
+            raise _not_art_inception(path, f"{name} belongs to another network")
+    for name, value in expected.items():
+        _check_tensor(path, name, state.get(name), value)
+    network.load_state_dict({name: state[name].to(value.dtype) for name, value in expected.items()}, assign=True)
+    return network.eval().requires_grad_(False)
+
+
+def _check_tensor(path: Path, name: str, found: Any, expected: Tensor) -> None:
+    if not isinstance(found, Tensor):
+        raise _not_art_inception(path, f"{name} is missing")
+    if found.shape != expected.shape:
+        raise _not_art_inception(path, f"{name} has the shape {tuple(found.shape)} instead of {tuple(expected.shape)}")
+    if not found.isfinite().all():
+        raise _not_art_inception(path, f"{name} has values that are not finite")
+
+
+def _not_art_inception(path: Path, reason: str) -> InputError:
+    return InputError(
+        f"{path} is not the Inception-v3 of ArtFID's authors ({reason}): fetch their {ART_INCEPTION_FILE} again, or "
+        "take the file away to measure without ArtFID."
+    )
+
+
+_loaded = functools.cache(load_art_inception)
+
+
+def missing_weights() -> List[str]:
+    """The files that ArtFID needs and the torch hub cache doesn't have."""
+    return [name for name in (ART_INCEPTION_FILE, ALEXNET_FILE) if not (hub_folder() / name).is_file()]
+
+
+def why_left_out(figures: Dict[str, float]) -> str:
+    """A sentence on ArtFID where `figures` don't have it; nothing where they do."""
+    if "art_fid" in figures:
+        return ""
+    missing = missing_weights()
+    if missing:
+        return f"ArtFID is left out: it needs {' and '.join(missing)} in {hub_folder()}."
+    return "ArtFID is left out: there was no painting to measure against."
+
+
+class ArtFID:
+    """ArtFID of pictures that are added one by one.
+
+    Args:
+        network: see `load_art_inception`.
+        painting: the style, in [0, 1].
+    """
+
+    def __init__(self, network: nn.Module, painting: Float[Tensor, "3 H W"]) -> None:
+        self.network = network
+        self._style = self._features(resized(painting.permute(1, 2, 0)))
+        self._stylised: List[Tensor] = []
+        self._lpips: List[float] = []
+
+    @classmethod
+    def against(cls, painting: Float[Tensor, "3 H W"]) -> Optional["ArtFID"]:
+        """With the weights in the torch hub cache; None where some are missing.
+
+        Raises:
+            InputError: the file of the Inception-v3 is another network's.
+        """
+        return None if missing_weights() else cls(_loaded(hub_folder() / ART_INCEPTION_FILE), painting)
+
+    @torch.no_grad()
+    def _features(self, picture: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "squares 2048"]:
+        return self.network(squares(picture))
+
+    def add(self, stylised: Float[Tensor, "H W 3"], content: Float[Tensor, "H W 3"]) -> None:
+        """Adds a stylised picture, and what it must stay like."""
+        first, second = resized(stylised), resized(content)
+        metric = lpips_metric(first.shape[2:])
+        assert metric is not None
+        self._lpips.append(float(metric(first, second)))
+        self._stylised.append(self._features(first))
+
+    def figures(self) -> Dict[str, float]:
+        """`art_fid` of all pictures so far, of which there is one at least; 1 is the least that it can be."""
+        distance = frechet_distance(torch.cat(self._stylised), self._style)
+        return {"art_fid": (1.0 + sum(self._lpips) / len(self._lpips)) * (1.0 + distance)}

@@ -1,0 +1,133 @@
+"""How alike two views of a stylised scene are where both show the same points (short- and long-range consistency)."""
+
+from typing import Callable, Dict, List, Optional, Sequence
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from sparsestyle_ns.metrics.image import lpips_metric, st_lpips_metric
+from sparsestyle_ns.metrics.warping import Correspondence, Surface, correspond, sample_picture
+from sparsestyle_ns.utils.progress import track
+
+RANGES = {"short": 1, "long": 7}
+"""Frames between the two views of a pair, as in Stylos and Styl3R."""
+SSIM_SIGMA = 1.5
+SSIM_RADIUS = 5
+"""The Gaussian window of SSIM (Wang et al. 2004): 11 × 11."""
+SSIM_CONSTANTS = (0.01**2, 0.03**2)
+
+
+def masked_rmse(
+    first: Float[Tensor, "H W 3"], second: Float[Tensor, "H W 3"], visible: Bool[Tensor, "H W"]
+) -> Float[Tensor, ""]:
+    """Root of the mean squared difference over visible pixels and channels; NaN where none is visible."""
+    return (first - second)[visible].square().mean().sqrt()
+
+
+def masked_ssim(
+    first: Float[Tensor, "H W C"], second: Float[Tensor, "H W C"], visible: Bool[Tensor, "H W"]
+) -> Float[Tensor, ""]:
+    """Mean structural similarity over visible pixels, of pictures in [0, 1]; NaN where none is visible.
+
+    SSIM (Wang et al. 2004) with each window's weights shared out among its visible pixels, so that neither what is
+    occluded nor what lies beyond the border has a say.
+    """
+    offsets = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, device=first.device, dtype=first.dtype)
+    profile = torch.exp(-0.5 * (offsets / SSIM_SIGMA).square())
+    window = torch.outer(profile, profile)[None, None] / profile.sum().square()
+    mask = visible.to(first.dtype)[None, None]
+    share = F.conv2d(mask, window, padding=SSIM_RADIUS).clamp_min(torch.finfo(first.dtype).tiny)
+
+    def mean(values: Float[Tensor, "C 1 H W"]) -> Float[Tensor, "C 1 H W"]:
+        return F.conv2d(values * mask, window, padding=SSIM_RADIUS) / share
+
+    x, y = (picture.permute(2, 0, 1)[:, None] for picture in (first, second))
+    mean_x, mean_y = mean(x), mean(y)
+    variance_x, variance_y = mean(x * x) - mean_x.square(), mean(y * y) - mean_y.square()
+    covariance = mean(x * y) - mean_x * mean_y
+    c1, c2 = SSIM_CONSTANTS
+    likeness = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
+    likeness = likeness / ((mean_x.square() + mean_y.square() + c1) * (variance_x + variance_y + c2))
+    return likeness[:, 0].mean(dim=0)[visible].mean()
+
+
+def masked_distance(
+    metric: Callable[[Tensor, Tensor], Tensor],
+    first: Float[Tensor, "H W 3"],
+    second: Float[Tensor, "H W 3"],
+    visible: Bool[Tensor, "H W"],
+) -> float:
+    """A perceptual distance of visible pixels.
+
+    What isn't visible is black in both pictures, where they are alike, and the distance, a mean over the whole picture,
+    is divided by the visible share.
+
+    Args:
+        metric: a distance of two batches [1, 3, H, W] in [0, 1], 0 where they are equal; a mean over pixels.
+    """
+    mask = visible[..., None]
+    pictures = (torch.where(mask, picture, 0.0).permute(2, 0, 1)[None].cpu() for picture in (first, second))
+    return float(metric(*pictures)) / float(visible.float().mean())
+
+
+@torch.no_grad()
+def pair_consistency(
+    first: Float[Tensor, "H W 3"], second: Float[Tensor, "H W 3"], correspondence: Correspondence
+) -> Dict[str, float]:
+    """`rmse`, `ssim`, and where there are weights `lpips` and `st_lpips`, between a view and another one warped to it.
+
+    Over visible pixels, of pictures in [0, 1]. Nothing where no pixel is visible.
+    """
+    visible = correspondence.visible
+    if not visible.any():
+        return {}
+    first, second = first.clamp(0.0, 1.0), second.clamp(0.0, 1.0)
+    warped = sample_picture(second, correspondence.pixels)
+    values = {
+        "rmse": float(masked_rmse(first, warped, visible)),
+        "ssim": float(masked_ssim(first, warped, visible)),
+    }
+    for name, metric in (("lpips", lpips_metric(first.shape[:2])), ("st_lpips", st_lpips_metric(first.shape[:2]))):
+        if metric is not None:
+            values[name] = masked_distance(metric, first, warped, visible)
+    return values
+
+
+class PathGeometry:
+    """Which pixels of a path's frames show the same points; worked out once for all pictures that are measured by it.
+
+    Args:
+        surfaces: what each frame shows of the unstylised scene.
+    """
+
+    def __init__(self, surfaces: Sequence[Surface]) -> None:
+        self.pairs = {
+            name: [
+                correspond(surfaces[t], surfaces[t + gap])
+                for t in track(range(len(surfaces) - gap), f"Matching frames, {name} range")
+            ]
+            for name, gap in RANGES.items()
+        }
+
+    def visible_share(self, name: str) -> Optional[float]:
+        """Share of pixels that count in a range's pairs; None where the path has no such pair."""
+        shares = [float(pair.visible.float().mean()) for pair in self.pairs[name]]
+        return sum(shares) / len(shares) if shares else None
+
+    def consistency(self, frames: Sequence[Float[Tensor, "H W 3"]]) -> Dict[str, float]:
+        """`short_rmse`, `short_ssim` …, `long_rmse` …: means over all pairs of the range that share a pixel."""
+        means = {}
+        for name, gap in RANGES.items():
+            pairs = track(self.pairs[name], f"Consistency, {name} range")
+            values = [
+                pair_consistency(frames[t], frames[t + gap], correspondence) for t, correspondence in enumerate(pairs)
+            ]
+            means.update({f"{name}_{key}": value for key, value in _means(values).items()})
+        return means
+
+
+def _means(values: List[Dict[str, float]]) -> Dict[str, float]:
+    kept = [value for value in values if value]
+    return {key: sum(value[key] for value in kept) / len(kept) for key in kept[0]} if kept else {}

@@ -1,0 +1,1 @@
+"""Runs on disk: finding, reading and matching them."""

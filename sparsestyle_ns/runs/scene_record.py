@@ -1,0 +1,85 @@
+"""What a run was trained on, saved beside its config, so that a later run can tell whether it fits."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Dict, List, Optional
+
+import numpy as np
+
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import write_whole
+
+FILE_NAME = "scene.json"
+
+
+@dataclass
+class SceneRecord:
+    """The photos of a run.
+
+    Attributes:
+        data: folder or file of the scene, absolute.
+        view_ids: the training views' ids.
+        view_names: their file names.
+        scene_box: corners of the scene's box.
+        cameras: camera-to-world matrix, [3][4], of each training view, after the dataparser's scaling.
+        background_color: RGB behind the scene, or None.
+        effects: which of the effects that are decided on photos are on.
+    """
+
+    data: str
+    view_ids: List[int]
+    view_names: List[str]
+    scene_box: List[List[float]]
+    cameras: List[List[List[float]]]
+    background_color: Optional[List[float]] = None
+    effects: Dict[str, bool] = field(default_factory=dict)
+
+    def save(self, folder: Path) -> None:
+        """Writes `scene.json` into a run's folder."""
+        write_whole(folder / FILE_NAME, json.dumps(asdict(self), indent=1) + "\n")
+
+    @classmethod
+    def load(cls, folder: Path) -> "SceneRecord":
+        """Reads `scene.json` of a run's folder.
+
+        Raises:
+            InputError: there is none, or it can't be read.
+        """
+        path = folder / FILE_NAME
+        try:
+            return cls(**json.loads(path.read_text()))
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(f"{path} is missing or damaged; is {folder} the folder of a finished run?") from error
+
+    def difference(self, other: "SceneRecord") -> Optional[str]:
+        """In words, what keeps a field trained on `other` from fitting this scene; None where nothing does."""
+        if self.view_ids != other.view_ids or self.view_names != other.view_names:
+            return f"it was trained on views {other.view_ids} ({', '.join(other.view_names)})"
+        for name, on in self.effects.items():
+            if on != other.effects.get(name):
+                word = "on" if other.effects.get(name) else "off"
+                flag = f"--pipeline.effects.{name.replace('_', '-')} {word}"
+                return f"it was made with the effect {name} {word}, as by {flag}"
+        if self.background_color != other.background_color:
+            return f"its background has the colour {other.background_color} in place of {self.background_color}"
+        mine, theirs = [*self.cameras, self.scene_box], [*other.cameras, other.scene_box]
+        if any(not np.allclose(first, second, atol=1e-4) for first, second in zip(mine, theirs, strict=True)):
+            return "its cameras stand elsewhere: another scene, or other settings of the dataparser"
+        return None
+
+
+def record_scene(datamanager: FewShotDataManager) -> SceneRecord:
+    """The record of a data manager's training views."""
+    dataset = datamanager.train_dataset
+    background = datamanager.effects.build("background")
+    return SceneRecord(
+        data=str(Path(datamanager.config.data).resolve()),
+        view_ids=list(datamanager.view_ids),
+        view_names=[path.name for path in dataset._dataparser_outputs.image_filenames],
+        scene_box=dataset.scene_box.aabb.tolist(),
+        cameras=dataset.cameras.camera_to_worlds.tolist(),
+        background_color=None if background is None else background.tolist(),
+        effects=datamanager.effects.on_photos(),
+    )

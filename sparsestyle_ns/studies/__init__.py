@@ -1,0 +1,1 @@
+"""Studies of many runs or settings: `compare`, `ablate` and `tradeoff`."""

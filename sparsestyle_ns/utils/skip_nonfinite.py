@@ -1,0 +1,78 @@
+"""Optimisers that leave everything as it is where a gradient isn't finite."""
+
+from typing import Any, Dict, Iterable, List, NamedTuple
+
+import torch
+from jaxtyping import Float
+from nerfstudio.engine.optimizers import Optimizers
+from torch import Tensor, nn
+from torch.amp import GradScaler
+from torch.nn.utils import get_total_norm
+from torch.optim import Optimizer
+
+from sparsestyle_ns.utils.distributed import average_gradients
+
+
+class Skipped(NamedTuple):
+    """Steps that weren't taken.
+
+    Attributes:
+        total: how many since the optimisers were made.
+        in_a_row: how many since the last one that was taken.
+    """
+
+    total: int
+    in_a_row: int
+
+
+def broken(parameters: Iterable[nn.Parameter]) -> Float[Tensor, ""]:
+    """1 where the squares of all gradients don't add up to a finite number, else 0; stays on the device.
+
+    Squares, because Adam keeps their running mean: one that overflows would stop its parameter for good.
+    """
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    return 1.0 - torch.isfinite(get_total_norm(gradients)).float()
+
+
+def step_if_finite(optimizer: Optimizer, is_broken: Float[Tensor, ""]) -> bool:
+    """Prepares an optimiser for a step: with `is_broken` 1, parameters, means and step count stay as they are.
+
+    Fused optimisers look at the flag where they run, so that nothing waits for a GPU.
+
+    Returns:
+        Whether the step is to be called; false for optimisers that can't look at the flag themselves.
+    """
+    if getattr(optimizer, "_step_supports_amp_scaling", False):
+        optimizer.found_inf = is_broken
+        return True
+    return not is_broken.item()
+
+
+class FiniteOptimizers(Optimizers):
+    """nerfstudio's optimisers; a step whose gradient isn't finite is skipped and counted.
+
+    The iteration still counts as one: learning rate, λ, view and batch go by its number, and the next one sees others.
+    Gradients are averaged over all processes before, so that all of them skip the same steps.
+    """
+
+    def __init__(self, config: Dict[str, Any], param_groups: Dict[str, List[nn.Parameter]]) -> None:
+        super().__init__(config, param_groups)
+        device = next(iter(param_groups.values()))[0].device
+        self._skipped = torch.zeros(2, device=device)
+
+    def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: List[str]) -> None:
+        """Steps these groups, or none of them."""
+        parameters = [parameter for name in param_groups for parameter in self.parameters[name]]
+        if not parameters:
+            return
+        average_gradients(parameters)
+        is_broken = broken(parameters)
+        self._skipped[0] += is_broken
+        self._skipped[1] = (self._skipped[1] + 1.0) * is_broken
+        if not grad_scaler.is_enabled():  # an enabled one skips such steps itself
+            param_groups = [name for name in param_groups if step_if_finite(self.optimizers[name], is_broken)]
+        super().optimizer_scaler_step_some(grad_scaler, param_groups)
+
+    def skipped(self) -> Skipped:
+        """The counts; waits for a GPU."""
+        return Skipped(*map(int, self._skipped.tolist()))

@@ -1,0 +1,69 @@
+import torch
+from torch import nn
+
+from sparsestyle_ns.losses.content import content_loss
+from sparsestyle_ns.losses.nnfm import nnfm_loss
+from sparsestyle_ns.losses.stylization import StyleTargets, feature_rows, fit_side, sample_rows
+
+
+class Patches(nn.Module):
+    """A feature network that gives each 4 × 4 block of pixels its own colours as features."""
+
+    def forward(self, images):
+        return nn.functional.pixel_unshuffle(images, 4)
+
+
+def make_targets():
+    torch.manual_seed(0)
+    return StyleTargets(Patches(), torch.rand(3, 16, 16), feature_side=16, style_side=16)
+
+
+def test_fit_side_makes_the_longer_side_as_asked_and_keeps_the_proportions():
+    assert fit_side(torch.rand(1, 3, 20, 40), 20).shape == (1, 3, 10, 20)
+    assert fit_side(torch.rand(1, 3, 40, 20), 80).shape == (1, 3, 80, 40)
+    image = torch.rand(1, 3, 20, 40)
+    assert fit_side(image, 40) is image
+
+
+def test_losses_are_those_of_all_features_where_nothing_is_transparent():
+    targets, image, photo = make_targets(), torch.rand(16, 16, 3), torch.rand(16, 16, 3)
+    content = targets.features(photo)
+    style, moved = targets.losses(image, content)
+    rows = feature_rows(targets.features(image))
+    torch.testing.assert_close(style, nnfm_loss(rows, targets.style))
+    torch.testing.assert_close(moved, content_loss(rows, feature_rows(content)))
+    for same in zip(targets.losses(image, content, torch.ones(16, 16)), (style, moved), strict=True):
+        torch.testing.assert_close(*same)
+
+
+def test_what_the_background_shows_changes_no_loss():
+    targets, photo = make_targets(), torch.rand(16, 16, 3)
+    content = targets.features(photo)
+    accumulation = torch.zeros(16, 16)
+    accumulation[:, 8:] = 1.0
+    first, second = torch.rand(2, 16, 16, 3)
+    second[:, 8:] = first[:, 8:]
+    for one, other in zip(
+        targets.losses(first, content, accumulation), targets.losses(second, content, accumulation), strict=True
+    ):
+        torch.testing.assert_close(one, other)
+    assert targets.losses(first, content)[0] != targets.losses(second, content)[0]
+
+
+def test_with_few_style_features_the_loss_is_that_against_some_of_the_painting():
+    torch.manual_seed(0)
+    picture, image = torch.rand(3, 16, 16), torch.rand(16, 16, 3)
+    losses = []
+    for count in (None, 16, 4, 1):
+        targets = StyleTargets(Patches(), picture, 16, 16, style_features=count)
+        losses.append(float(targets.losses(image, targets.features(image))[0]))
+    assert losses[0] == losses[1]  # there are 16 in all
+    assert losses[1] < losses[2] < losses[3]
+
+
+def test_a_sample_of_rows_keeps_their_order_and_repeats_none():
+    rows = torch.arange(100.0)[:, None]
+    drawn = sample_rows(rows, 30).flatten()
+    assert len(drawn.unique()) == 30
+    assert drawn.equal(drawn.sort().values)
+    assert drawn.equal(sample_rows(rows, 30).flatten())
