@@ -102,7 +102,7 @@ def evaluate(
 
         load_style_image(style_image)
     from sparsestyle_ns.engine.hints import after_evaluation, finish
-    from sparsestyle_ns.evaluation.held_out import evaluate_run
+    from sparsestyle_ns.engine.loading import evaluate_run
     from sparsestyle_ns.evaluation.tables import report_tables
 
     report = evaluate_run(config, path, style_image, baked)

@@ -26,7 +26,8 @@ from scipy.spatial.transform import Rotation
 from sparsestyle_ns.effects.registry import EFFECTS
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
-from sparsestyle_ns.runs.coarse_run import newest_checkpoint, read_coarse_run
+from sparsestyle_ns.runs.checkpoints import newest_checkpoint
+from sparsestyle_ns.runs.coarse_run import read_coarse_run
 from sparsestyle_ns.style import vgg
 
 METHODS = ("coarse-fewshot", "coarse-fewshot-draft", "hier-style", "hier-style-draft")
@@ -96,7 +97,7 @@ def test_the_defaults_are_the_papers() -> None:
     assert (optimizer.lr, optimizer.betas) == (5e-3, (0.9, 0.999))
     assert (scheduler.gamma, scheduler.milestones) == (0.33, (50, 100))
     settings, model = style.pipeline, style.pipeline.model
-    assert (settings.content_weight, settings.content_decay, settings.content_steps) == (10.0, 0.01, 100)
+    assert (settings.loss_weights["content"], settings.content_decay, settings.content_steps) == (10.0, 0.01, 100)
     assert (model.hash_levels, model.min_resolution, model.max_resolution) == (8, 128, 512)
     assert (model.features_per_level, model.log2_table_size) == (4, 19)
     assert (model.hidden_layers, model.layer_width) == (2, 256)

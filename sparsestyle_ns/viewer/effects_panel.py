@@ -1,21 +1,21 @@
 """The table of effects in the viewer."""
 
-from typing import Callable
-
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from viser import ViserServer
+
+from sparsestyle_ns.pipelines.base import CheckedPipeline
 
 
 class EffectsPanel(ViewerElement[str]):
     """A table of text in the viewer's list of controls.
 
     Args:
-        markdown: gives the text whenever the panel is made.
+        pipeline: whose effects are told.
     """
 
-    def __init__(self, markdown: Callable[[], str]) -> None:
+    def __init__(self, pipeline: CheckedPipeline) -> None:
         super().__init__("Effects")
-        self.markdown = markdown
+        self.markdown = lambda: pipeline.effects.markdown()
 
     def _create_gui_handle(self, viser_server: ViserServer) -> None:
         self.gui_handle = viser_server.gui.add_markdown(self.markdown(), visible=self.visible)

@@ -6,7 +6,7 @@ import threading
 import time
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, Callable, List, Optional, Tuple
+from typing import Any, Callable, Dict, List, Optional, Tuple
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from torch import nn
 
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
+from sparsestyle_ns.losses.stylization import Losses
 from sparsestyle_ns.models.hier_style import RENDER_MODES, Look
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.utils.errors import InputError
@@ -121,6 +122,7 @@ class StylePanel(ViewerControl):
         self._guard_outputs()
         self._hide_frustums()
         self.pipeline.model.viewer_look = self.look
+        self.pipeline.on_losses = self.show_losses
         if self.pipeline.device.type == "cpu":
             cameras = self.pipeline.datamanager.train_dataset.cameras
             self.baker = Baker(self.pipeline.model, cameras, self._shown, self._is_free, self._lock())
@@ -286,25 +288,19 @@ class StylePanel(ViewerControl):
 
     # Training
 
-    def show_losses(self, losses: Any) -> None:
-        """Tells of an iteration of training, where there is a viewer.
-
-        Args:
-            losses: a `StepLosses`.
-        """
+    def show_losses(self, step: int, losses: Losses) -> None:
+        """Tells of an iteration of training, where there is a viewer."""
         if self.viewer is None:
             return
-        total = self.viewer.trainer._total
-        if not self._losses_told.is_due(at_once=losses.step + 1 == total):
+        total = self.viewer.trainer.config.max_num_iterations
+        if not self._losses_told.is_due(at_once=step + 1 == total):
             return
         if not self._described:
             self._described = True
             self._describe_run()
             self.training.set_visible(True)
-        content, style = float(losses.content.detach()), float(losses.style.detach())
-        self.training.content = _loss_text(
-            f"Iteration {losses.step + 1} of {total}", losses.content_weight, content, style
-        )
+        values = {name: float(value) for name, value in losses.metrics().items()}
+        self.training.content = _loss_text(f"Iteration {step + 1} of {total}", values)
 
     # Restyling
 
@@ -407,7 +403,7 @@ class StylePanel(ViewerControl):
         self.bar.show(progress.done)
         text = f"Restyling. {progress.words}"
         if progress.losses is not None:
-            text = _loss_text(text, *progress.losses) + f", {_minutes(progress.seconds_left)} left"
+            text = _loss_text(text, progress.losses) + f", {_minutes(progress.seconds_left)} left"
         self.message.content = text
 
     def _end(self, message: str) -> None:
@@ -431,8 +427,9 @@ class Pace:
         return True
 
 
-def _loss_text(what: str, weight: float, content: float, style: float) -> str:
-    return f"{what}: λ {weight:.3g}, content {content:.3f}, style {style:.3f}"
+def _loss_text(what: str, values: Dict[str, float]) -> str:
+    shown = [f"{'λ' if name == 'lambda' else name} {value:.3g}" for name, value in values.items()]
+    return f"{what}: {', '.join(shown)}"
 
 
 def _effects_text(effects: Decisions) -> str:

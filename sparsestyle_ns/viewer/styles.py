@@ -11,7 +11,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor, nn
 
-from sparsestyle_ns.runs.coarse_run import load_checkpoint, newest_checkpoint
+from sparsestyle_ns.runs.checkpoints import load_checkpoint, newest_checkpoint
 from sparsestyle_ns.style.painting import decode_style_image, read_bytes
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole

@@ -15,7 +15,6 @@ from torch import Tensor
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings, decide
 from sparsestyle_ns.engine.training import Training
-from sparsestyle_ns.evaluation.held_out import evaluate_held_out
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.style.color import color_moments, gaussian_distance
@@ -170,7 +169,7 @@ def test_residual_density_lets_the_style_change_a_hazy_scene(scenes, painting):
     losses = []
     for choice in ("on", "off"):
         pipeline = trained_style(folder, "blender", painting, hazy, 60, {"residual_density": choice})
-        losses.append(evaluate_held_out(pipeline, pipeline.painting()).means["style_loss"])
+        losses.append(pipeline.held_out_report().means["style_loss"])
     assert losses[0] < 0.95 * losses[1]
 
 

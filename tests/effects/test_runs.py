@@ -13,9 +13,10 @@ import sparsestyle_ns.pipelines.datamanager as datamanager
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.exposure import ExposureCorrection
 from sparsestyle_ns.effects.registry import EFFECTS
+from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.gallery.page import RunPictures, gallery_page
-from sparsestyle_ns.runs.coarse_run import newest_checkpoint
-from sparsestyle_ns.runs.run_folder import find_config, load_run
+from sparsestyle_ns.runs.checkpoints import newest_checkpoint
+from sparsestyle_ns.runs.run_folder import find_config
 from sparsestyle_ns.viewer.effects_panel import EffectsPanel
 
 AUTO = [flag for flag in TINY if flag not in ("--pipeline.effects.empty-space", "on")]

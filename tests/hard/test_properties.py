@@ -20,6 +20,7 @@ from nerfstudio.data.scene_box import SceneBox
 from PIL import Image
 from torch.nn.functional import normalize
 
+import sparsestyle_ns.core
 import sparsestyle_ns.field_components
 import sparsestyle_ns.losses
 import sparsestyle_ns.rendering
@@ -38,14 +39,15 @@ from sparsestyle_ns.field_components import (
 )
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
-from sparsestyle_ns.losses import content, geometry, nnfm, reconstruction, semantic
+from sparsestyle_ns.losses import content, geometry, nnfm, reconstruction, semantic, style_index
 from sparsestyle_ns.losses import stylization as targets
 from sparsestyle_ns.rendering import baked, frozen_view, mixing
 from sparsestyle_ns.rendering import render as volume
-from sparsestyle_ns.style import color, vgg
+from sparsestyle_ns.style import backbones, color
 from sparsestyle_ns.style import painting as image
 
 PACKAGES = [
+    sparsestyle_ns.core,
     sparsestyle_ns.rendering,
     sparsestyle_ns.field_components,
     sparsestyle_ns.losses,
@@ -55,7 +57,12 @@ COVERED = set()
 ELSEWHERE = {
     "sparsestyle_ns.field_components.hash_grid_triton": "needs CUDA or Triton's interpreter: test_hash_grid.py",
     "sparsestyle_ns.rendering.baked_kernels.march_rays": "is what march_compiled calls",
-    "sparsestyle_ns.style.vgg.available_backbone": "takes no input: test_studies.py",
+    "sparsestyle_ns.core.camera_paths": "takes nerfstudio's cameras: test_camera_paths.py",
+    "sparsestyle_ns.core.schedules": "test_schedules.py and test_hard_schedules.py",
+    "sparsestyle_ns.losses.stylization.default_weights": "takes no input: test_stylization.py",
+    "sparsestyle_ns.losses.style_index.check_style": "refuses, and returns nothing: test_nnfm.py",
+    "sparsestyle_ns.style.backbone.check_tensor": "reads weight files: test_vgg.py",
+    "sparsestyle_ns.style.backbones": "reads weight files: test_vgg.py",
     "sparsestyle_ns.field_components.tiny_cuda_grid.has_tiny_cuda_nn": "asks what is installed: test_hier_style.py",
     "sparsestyle_ns.rendering.baked.march_compiled": "is what render_baked calls on a CPU",
 }
@@ -536,13 +543,13 @@ def test_both_hash_grids_agree_and_stay_in_the_table(data, count, levels, highes
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-@covers(nnfm.nearest_neighbors, nnfm.nnfm_loss)
+@covers(nnfm.nearest_neighbors, nnfm.nnfm_loss, style_index.unit_vectors)
 @given(st.data(), st.integers(1, 40), st.integers(1, 60), st.integers(1, 8), ALL_FLOATS, st.integers(1, 70))
 def test_neighbours_are_the_most_similar(data, count, style_count, channels, dtype, chunk_size):
     largest = 4 if dtype == torch.float16 else 15
     features = data.draw(tensors((count, channels), -3, largest, signed=True, dtype=dtype)).requires_grad_()
     style = data.draw(tensors((style_count, channels), -3, largest, signed=True, dtype=dtype))
-    index = nnfm.StyleIndex(style, block_size=data.draw(COUNTS))
+    index = style_index.StyleIndex(style, block_size=data.draw(COUNTS))
     directions = normalize(style.double(), dim=-1)
     similarities = normalize(features.detach().double(), dim=-1) @ directions.T
     for found in (nnfm.nearest_neighbors(features, style, chunk_size), index.nearest(features)):
@@ -659,10 +666,10 @@ def test_pictures_are_read_as_they_were_written(tmp_path_factory, pixels, max_si
 
 @pytest.fixture(scope="module")
 def backbone():
-    return vgg.load_backbone("vgg16-shift-tolerant")
+    return backbones.load_backbone("vgg16-shift-tolerant")
 
 
-@covers(vgg.load_backbone, targets.fit_side, targets.feature_rows, targets.covered_rows, targets.sample_rows)
+@covers(backbones.load_backbone, targets.fit_side, targets.feature_rows, targets.covered_rows, targets.sample_rows)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(8, 24), st.floats(0, 1), SEEDS)
 def test_pictures_of_any_shape_have_features(backbone, height, width, side, contrast, seed):
     picture = contrast * torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(seed))

@@ -25,13 +25,15 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer import Viewer
 from PIL import Image
 
+from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
 from sparsestyle_ns.engine.training import Training
+from sparsestyle_ns.engine.training_step import warm_start
 from sparsestyle_ns.export.command import load_scene
 from sparsestyle_ns.gallery.collect import collect_run
+from sparsestyle_ns.losses.stylization import Losses
 from sparsestyle_ns.models.hier_style import MOST_BAKED
-from sparsestyle_ns.pipelines.hier_style import StepLosses
-from sparsestyle_ns.runs.run_folder import find_config, load_run
+from sparsestyle_ns.runs.run_folder import find_config
 from sparsestyle_ns.viewer.baking import STEPS_BETWEEN
 from sparsestyle_ns.viewer.panel import NO_BLEND, StylePanel
 from sparsestyle_ns.viewer.styles import Style, StyleImage, plain
@@ -284,14 +286,14 @@ def test_training_and_restyling_are_told_apart_and_their_last_step_always(
     panel: StylePanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sparsestyle_ns.viewer.panel.SECONDS_BETWEEN_TEXTS", 1e9)
-    trainer = SimpleNamespace(_total=9, notes=dict, training_state="completed")
+    trainer = SimpleNamespace(config=SimpleNamespace(max_num_iterations=9), notes=dict, training_state="completed")
     monkeypatch.setattr(panel.viewer, "trainer", trainer)
     monkeypatch.setattr(panel, "_described", True)
     told: List[str] = []
     for step in (0, 1, 8):
         content, style = torch.tensor([2.0, 3.0])
-        panel._tell(Progress("Iteration", step / 8, 1.0, (4.0, 5.0, 6.0)))
-        panel.show_losses(StepLosses(step, 1.0, content, style))
+        panel._tell(Progress("Iteration", step / 8, 1.0, {"lambda": 4.0, "content": 5.0, "style": 6.0}))
+        panel.show_losses(step, Losses({"content": content, "style": style}, {"content": 1.0, "style": 1.0}))
         told += [panel.training.content.split(":")[0], f"{panel.bar.gui_handle.value:.0f}"]
     panel._end("")
     assert told == ["Iteration 1 of 9", "0", "Iteration 1 of 9", "0", "Iteration 9 of 9", "100"]
@@ -442,7 +444,7 @@ def test_restyling_takes_the_trainers_steps(runs: SimpleNamespace, painting: Pat
     pipeline = training.pipeline
     fresh = pipeline.model.new_style()
     pipeline.model.residual.load_state_dict(fresh.state_dict())
-    for _ in pipeline.warm_up(pipeline.task(), config.optimizers["fields"]["optimizer"].lr):
+    for _ in warm_start(pipeline, pipeline.task, config.optimizers["fields"]["optimizer"].lr):
         pass
     for _ in range(3):
         training.step()

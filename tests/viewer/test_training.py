@@ -12,9 +12,9 @@ import pytest
 import torch
 from conftest import TINY_STYLE, ns_train
 
-from sparsestyle_ns.engine.trainer import HierStyleTrainer
-from sparsestyle_ns.runs.coarse_run import newest_checkpoint
-from sparsestyle_ns.runs.run_folder import load_run
+from sparsestyle_ns.engine.loading import load_run
+from sparsestyle_ns.engine.style_trainer import HierStyleTrainer
+from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 
 
 def train_with_viewer(
