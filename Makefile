@@ -20,8 +20,8 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 help:
 	@echo "make demo   sample photos and a painting -> stylised scene, video and page in demo/index.html"
-	@echo "make test   ruff, then the tests"
-	@echo "make lint   ruff alone; 'make lint FIX=1' repairs what it can"
+	@echo "make test   lint, then the tests"
+	@echo "make lint   ruff and import-linter; 'make lint FIX=1' repairs what it can"
 	@echo "make bench  times it beside nerfstudio and the plain way; hours, table in benchmarks/results/summary.md"
 	@echo "make clean  removes the environment, caches and the demo"
 	@echo
@@ -40,6 +40,7 @@ ifdef FIX
 else
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
 endif
 
 bench: $(READY)

@@ -20,10 +20,10 @@ import torch
 import yaml
 from conftest import TINY, TINY_STYLE, ns_train, only_run, run_entrypoint
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.trainer import Trainer
 from scipy.spatial.transform import Rotation
 
 from sparsestyle_ns.effects.registry import EFFECTS
+from sparsestyle_ns.engine.trainer import SparseStyleTrainer
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.runs.checkpoints import newest_checkpoint
@@ -48,14 +48,14 @@ def render(subcommand: str, run: Path, output: Path, *flags: str) -> None:
 
 def press_ctrl_c_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
     """Has the user press Ctrl-C in the middle of an iteration."""
-    train_iteration = Trainer.train_iteration
+    train_iteration = SparseStyleTrainer.train_iteration
 
-    def press(trainer: Trainer, current: int):
+    def press(trainer: SparseStyleTrainer, current: int):
         if current == step:
             signal.raise_signal(signal.SIGINT)
         return train_iteration(trainer, current)
 
-    monkeypatch.setattr(Trainer, "train_iteration", press)
+    monkeypatch.setattr(SparseStyleTrainer, "train_iteration", press)
 
 
 def assert_same_state(first: dict, second: dict) -> None:
@@ -140,7 +140,6 @@ def test_a_stylised_run_renders_without_painting_weights_and_coarse_run(
 
     monkeypatch.setattr(pipeline, "load_style_image", refuse)
     monkeypatch.setattr(base, "load_backbone", refuse)
-    monkeypatch.setattr(pipeline.HierStylePipelineConfig, "load_targets", refuse)
     hidden = runs.coarse.rename(runs.coarse.parent / "hidden")
     try:
         names = ["rgb", "rgb_coarse", "depth", "accumulation"]

@@ -674,7 +674,7 @@ def backbone():
 def test_pictures_of_any_shape_have_features(backbone, height, width, side, contrast, seed):
     picture = contrast * torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(seed))
     picture.requires_grad_()
-    fitted = targets.fit_side(picture, side)
+    fitted = targets.fit_side(picture, side, backbone.smallest_side)
     assert max(fitted.shape[-2:]) == side and min(fitted.shape[-2:]) >= 8
     maps = backbone(fitted)
     rows = targets.feature_rows(maps)
@@ -682,7 +682,7 @@ def test_pictures_of_any_shape_have_features(backbone, height, width, side, cont
     assert 1 <= len(targets.covered_rows(maps, accumulation)) <= len(rows) == len(targets.covered_rows(maps, None))
     kept = targets.sample_rows(rows, max(1, len(rows) // 2))
     assert len(kept) == max(1, len(rows) // 2) and targets.sample_rows(rows, len(rows)) is rows
-    assert rows.shape[1] == vgg.FEATURE_CHANNELS and (rows >= 0).all() and rows.isfinite().all()
+    assert rows.shape[1] == backbone.channels and (rows >= 0).all() and rows.isfinite().all()
     (gradient,) = torch.autograd.grad(rows.square().mean(), picture)
     assert gradient.isfinite().all()
 
