@@ -17,6 +17,8 @@ from sparsestyle_ns.models.hier_style import HierStyleModelConfig
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
+from sparsestyle_ns.viewer.effects_panel import EffectsPanel
+from sparsestyle_ns.viewer.panel import StylePanel
 
 
 def _logging(steps_per_log: int) -> LoggingConfig:
@@ -42,6 +44,7 @@ def _coarse_fewshot(draft: bool) -> TrainerConfig:
                 max_image_side=128 if draft else 1008,
             ),
             model=CoarseFewShotModelConfig(num_eval_samples=32 if draft else 64),
+            panel=EffectsPanel,
         ),
         optimizers={
             "fields": {
@@ -79,6 +82,7 @@ def _hier_style(draft: bool) -> TrainerConfig:
             else HierStyleModelConfig(),
             feature_side=252 if draft else 504,
             warm_start_steps=40 if draft else 60,
+            panel=StylePanel,
         ),
         optimizers={
             "fields": {

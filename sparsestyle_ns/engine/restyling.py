@@ -12,7 +12,7 @@ import time
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, ContextManager, Dict, Iterator, Optional, Tuple
+from typing import Any, ContextManager, Dict, Iterator, Optional
 
 import torch
 import yaml
@@ -23,13 +23,14 @@ from torch.amp import GradScaler
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import decide_again
 from sparsestyle_ns.runs.scene_record import FILE_NAME as SCENE_RECORD
+from sparsestyle_ns.runs.thumbnail import save_thumbnail
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.style.vgg import VGGFeatures
 from sparsestyle_ns.utils.distributed import num_processes
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.names import safe_file_name
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
-from sparsestyle_ns.viewer.styles import StyleImage, save_thumbnail
 
 SEED = 42
 """Of a new field's weights; nerfstudio's own."""
@@ -49,13 +50,13 @@ class Progress:
         words: what it is doing.
         done: the share of all its steps that are done, in [0, 1].
         seconds_left: a guess; None before the first iteration.
-        losses: λ, L_content and L_style of the last iteration; None before the first.
+        losses: those of the last iteration by name, and λ; None before the first.
     """
 
     words: str
     done: float = 0.0
     seconds_left: Optional[float] = None
-    losses: Optional[Tuple[float, float, float]] = None
+    losses: Optional[Dict[str, float]] = None
 
 
 class Workshop:
@@ -120,7 +121,7 @@ class Restyling:
         InputError: there are fewer iterations than one.
     """
 
-    def __init__(self, workshop: Workshop, image: StyleImage, iterations: Optional[int] = None) -> None:
+    def __init__(self, workshop: Workshop, image: Painting, iterations: Optional[int] = None) -> None:
         self.workshop, self.pipeline, self.image = workshop, workshop.pipeline, image
         self.config = workshop.config()
         self.iterations = self.config.max_num_iterations if iterations is None else iterations
@@ -154,7 +155,7 @@ class Restyling:
         scene = replace(self.pipeline.datamanager.scene, style_image=self.image.pixels)
         return decide_again(self.pipeline.effects, "palette", scene)
 
-    def _step(self, task: Any, step: int) -> Tuple[float, float, float]:
+    def _step(self, task: Any, step: int) -> Dict[str, float]:
         """One iteration, as nerfstudio's trainer makes it."""
         self.optimizers.zero_grad_all()
         _, losses = self.pipeline.step(task, step)
@@ -168,7 +169,7 @@ class Restyling:
                 f"The gradients of the last {in_a_row} iterations weren't finite; try another image, or a lower "
                 "learning rate in the run's config.yml."
             )
-        return losses.content_weight, float(losses.content.detach()), float(losses.style.detach())
+        return {name: float(value) for name, value in losses.metrics().items()}
 
     def save(self) -> Path:
         """Saves the style as a run of its own beside the one in the viewer, for ns-render, ns-viewer and the rest.

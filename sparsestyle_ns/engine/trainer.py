@@ -25,7 +25,7 @@ from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.hints import finish, ns_train_style, resume_command, scene_arguments
 from sparsestyle_ns.engine.previews import preview_steps, render_preview, save_preview
 from sparsestyle_ns.field_components.tiny_cuda_grid import has_tiny_cuda_nn
-from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
+from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
 from sparsestyle_ns.runs.coarse_run import (
     CoarseRun,
@@ -36,13 +36,13 @@ from sparsestyle_ns.runs.coarse_run import (
     read_coarse_run,
 )
 from sparsestyle_ns.runs.scene_record import record_scene
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.runs.thumbnail import save_thumbnail
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.distributed import any_process, from_first_process, prepare_launch, share_state
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.progress import bar, say
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
-from sparsestyle_ns.viewer.styles import StyleImage, save_thumbnail
 
 STEPS_PER_LOOK = 10
 """Iterations between looks at the count of skipped steps, each of which waits for a GPU."""
@@ -468,7 +468,7 @@ class HierStyleTrainer(SparseStyleTrainer):
 
     @check_main_thread
     def _keep_thumbnail(self) -> None:
-        save_thumbnail(self.base_dir, StyleImage.read(self.config.pipeline.style_image))
+        save_thumbnail(self.base_dir, Painting.read(self.config.pipeline.style_image))
 
     def notes(self) -> Dict[str, Any]:
         """Which feature network stylised the scene, where its weights came from, and which coarse run it builds on."""
@@ -539,7 +539,7 @@ class HierStyleTrainer(SparseStyleTrainer):
         """What is simulated: as in the coarse run, and the rest by its field and the painting."""
         settings, scene = self.config.pipeline, manager.scene
         scene.coarse_density = run.density(manager.effects)
-        scene.style_image = load_style_image(settings.style_image)
+        scene.style_image = Painting.read(settings.style_image).pixels
         return decide(scene, settings.effects, manager.effects)
 
     def _train_coarse(self, method: str, decided: Decisions) -> CoarseRun:

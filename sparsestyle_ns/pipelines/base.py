@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Dict, Literal, Optional, Union
+from typing import Annotated, Any, Callable, Dict, Literal, Optional, Union
 
 import torch
 import tyro
@@ -19,7 +19,6 @@ from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, FewShotData
 from sparsestyle_ns.style.vgg import VGGFeatures, load_backbone
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.ffmpeg import put_ffmpeg_on_path
-from sparsestyle_ns.viewer.effects_panel import EffectsPanel
 
 TestMode = Literal["test", "val", "inference"]
 
@@ -41,6 +40,8 @@ class CheckedPipelineConfig(VanillaPipelineConfig):
         "auto"
     )
     """Feature network; auto takes whichever of the two has weights."""
+    panel: tyro.conf.Suppress[Optional[Callable[["CheckedPipeline"], Union[ViewerElement, ViewerControl]]]] = None
+    """Makes what the viewer shows of a run beside nerfstudio's own controls; None: nothing."""
 
     def load_backbone(self, device: torch.device) -> VGGFeatures:
         """The feature network of these settings.
@@ -76,13 +77,9 @@ class CheckedPipeline(VanillaPipeline):
         config.decided = self.datamanager.effects
         config.datamanager.decided = None
         CONSOLE.print("Effects:", self.effects.text(), sep="\n", soft_wrap=True, highlight=False)
-        self.panel = self.make_panel()
+        self.panel = None if config.panel is None else config.panel(self)  # nerfstudio's viewer finds it here
         if test_mode != "val":
             put_ffmpeg_on_path()
-
-    def make_panel(self) -> Union[ViewerElement, ViewerControl]:
-        """What the viewer shows of this run beside nerfstudio's own controls."""
-        return EffectsPanel(lambda: self.effects.markdown())
 
     @property
     def effects(self) -> Decisions:

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Dict, Iterator, List, Optional, Tuple, Type
+from typing import Annotated, Any, Callable, Dict, Iterator, List, Optional, Tuple, Type
 
 import psutil
 import torch
@@ -25,13 +25,12 @@ from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.render import accumulation_of, seen_behind
 from sparsestyle_ns.style.color import apply_palette, color_moments
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.style.vgg import VGGFeatures
 from sparsestyle_ns.utils.distributed import average_gradients, gather_rays, num_processes, shard_rays
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress import bar, say, track
 from sparsestyle_ns.utils.skip_nonfinite import broken, step_if_finite
-from sparsestyle_ns.viewer.panel import StylePanel
 
 
 @dataclass
@@ -90,7 +89,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
             raise InputError("There is no style image: name a painting with --style-image FILE.")
         if self.style_features is not None and self.style_features < 1:
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
-        return load_style_image(self.style_image), self.load_backbone(torch.device("cpu"))
+        return Painting.read(self.style_image).pixels, self.load_backbone(torch.device("cpu"))
 
     def targets_of(self, image: Float[Tensor, "3 H W"], backbone: VGGFeatures) -> StyleTargets:
         """A painting as a feature network on its device sees it, with these settings."""
@@ -179,10 +178,8 @@ class HierStylePipeline(CheckedPipeline):
     targets: Optional[StyleTargets] = None
     scene_views: Optional[List[SceneView]] = None
     views: List[ContentView]
-
-    def make_panel(self) -> StylePanel:
-        """See `CheckedPipeline.make_panel`."""
-        return StylePanel(self)
+    on_losses: Optional[Callable[[StepLosses], None]] = None
+    """Told of each iteration's losses, by a viewer that shows them."""
 
     def task(self) -> StyleTask:
         """What this run trains."""
@@ -376,7 +373,8 @@ class HierStylePipeline(CheckedPipeline):
     def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Tensor], Dict[str, Tensor], Dict[str, Any]]:
         """One whole view: λ(t) L_content and L_style (Eq. 5 and 6)."""
         image, losses = self.step(self.task(), step)
-        self.panel.show_losses(losses)
+        if self.on_losses is not None:
+            self.on_losses(losses)
         return {"rgb": image}, losses.terms(), losses.metrics()
 
     @torch.no_grad()
