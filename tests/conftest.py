@@ -74,7 +74,8 @@ def coarse_pipeline(scene: Path, **settings: Any) -> "CoarseFewShotPipeline":
 
     from sparsestyle_ns.data.llff import LLFFDataParserConfig
     from sparsestyle_ns.effects.registry import EffectSettings
-    from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig, CoarseFieldConfig
+    from sparsestyle_ns.fields.coarse import CoarseFieldConfig
+    from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
     from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
     from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 

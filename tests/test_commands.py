@@ -138,7 +138,7 @@ def test_a_stylised_run_renders_without_painting_weights_and_coarse_run(
     def refuse(*args: object) -> None:
         raise AssertionError("rendering asked for the painting or the feature network")
 
-    monkeypatch.setattr(pipeline, "load_style_image", refuse)
+    monkeypatch.setattr(pipeline.Painting, "read", refuse)
     monkeypatch.setattr(base, "load_backbone", refuse)
     hidden = runs.coarse.rename(runs.coarse.parent / "hidden")
     try:

@@ -25,13 +25,14 @@ from sparsestyle_ns.engine.training_step import check_skipped, training_step, wa
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleInputs, StyleTask
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path, write_checkpoint
 from sparsestyle_ns.runs.scene_record import FILE_NAME as SCENE_RECORD
+from sparsestyle_ns.runs.thumbnail import save_thumbnail
 from sparsestyle_ns.style.backbone import Backbone
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.distributed import num_processes
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.names import safe_file_name
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
-from sparsestyle_ns.viewer.styles import StyleImage, save_thumbnail
 
 SEED = 42
 """Of a new field's weights; nerfstudio's own."""
@@ -122,7 +123,7 @@ class Restyling:
         InputError: there are fewer iterations than one.
     """
 
-    def __init__(self, workshop: Workshop, image: StyleImage, iterations: Optional[int] = None) -> None:
+    def __init__(self, workshop: Workshop, image: Painting, iterations: Optional[int] = None) -> None:
         self.workshop, self.pipeline, self.image = workshop, workshop.pipeline, image
         self.config = workshop.config()
         self.iterations = self.config.max_num_iterations if iterations is None else iterations
@@ -134,7 +135,7 @@ class Restyling:
     def __iter__(self) -> Iterator[Progress]:
         yield Progress(f"Looking at {self.image.name}")
         backbone = self.workshop.backbone()
-        targets = self.pipeline.config.targets_of(StyleInputs(self.image.pixels, backbone))
+        targets = self.pipeline.config.targets_of(StyleInputs(self.image, backbone))
         self.effects = self._decide()
         if self.pipeline.scene_views is None:
             yield Progress("Preparing the views, which the next style won't need")

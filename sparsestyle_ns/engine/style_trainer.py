@@ -19,16 +19,16 @@ from sparsestyle_ns.engine.hints import scene_arguments
 from sparsestyle_ns.engine.trainer import SparseStyleTrainer, SparseStyleTrainerConfig
 from sparsestyle_ns.engine.training_step import warm_start
 from sparsestyle_ns.field_components.tiny_cuda_grid import has_tiny_cuda_nn
-from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
+from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig, StyleInputs
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, load_checkpoint
 from sparsestyle_ns.runs.coarse_run import CoarseRun, check_scene, find_coarse_run, read_coarse_run
 from sparsestyle_ns.runs.scene_record import record_scene
+from sparsestyle_ns.runs.thumbnail import save_thumbnail
 from sparsestyle_ns.utils.distributed import from_first_process
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.progress import bar
-from sparsestyle_ns.viewer.styles import StyleImage, save_thumbnail
 
 PHOTO_SETTINGS = (
     "data",
@@ -108,7 +108,7 @@ class HierStyleTrainer(SparseStyleTrainer):
 
     @check_main_thread
     def _keep_thumbnail(self) -> None:
-        save_thumbnail(self.base_dir, StyleImage.read(self.config.pipeline.style_image))
+        save_thumbnail(self.base_dir, self._style.painting)
 
     def notes(self) -> CheckpointNotes:
         """Which feature network stylised the scene, where its weights came from, and which coarse run it builds on."""
@@ -181,7 +181,7 @@ class HierStyleTrainer(SparseStyleTrainer):
         """What is simulated: as in the coarse run, and the rest by its field and the painting."""
         scene = manager.scene
         scene.coarse_density = run.density(manager.effects)
-        scene.style_image = self._style.image
+        scene.style_image = self._style.painting.pixels
         return decide(scene, self.config.pipeline.effects, manager.effects)
 
     def _train_coarse(self, decided: Decisions) -> CoarseRun:

@@ -16,7 +16,7 @@ from sparsestyle_ns.evaluation.tables import report_tables
 from sparsestyle_ns.gallery.film import as_pixels, make_film
 from sparsestyle_ns.gallery.page import Picture, RunPictures, View, read_film
 from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.page import Pixels
 from sparsestyle_ns.utils.progress import say, track
@@ -144,7 +144,7 @@ def _style_picture(path: Optional[Path]) -> Optional[Picture]:
     if path is None:
         return None
     try:
-        image = load_style_image(path)
+        image = Painting.read(path).pixels
     except InputError:
         return None
     return Picture(_fitted(Image.fromarray(as_pixels(image.permute(1, 2, 0).numpy()))), path.name)

@@ -20,15 +20,15 @@ from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfi
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
 from sparsestyle_ns.pipelines.scene_views import ContentView, SceneViews
 from sparsestyle_ns.style.backbone import Backbone
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress import say
 
 
 class StyleInputs(NamedTuple):
-    """What a style is made from, read once a run: the painting, RGB in [0, 1], and the feature network."""
+    """What a style is made from, read once a run: the painting, and the feature network."""
 
-    image: Float[Tensor, "3 H W"]
+    painting: Painting
     backbone: Backbone
 
 
@@ -75,7 +75,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         self._check()
         if self.style_image is None:
             raise InputError("There is no style image: name a painting with --style-image FILE.")
-        return StyleInputs(load_style_image(self.style_image), self.load_backbone(torch.device("cpu")))
+        return StyleInputs(Painting.read(self.style_image), self.load_backbone(torch.device("cpu")))
 
     def _check(self) -> None:
         if self.style_features is not None and self.style_features < 1:
@@ -91,7 +91,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
 
     def targets_of(self, style: StyleInputs) -> StyleTargets:
         """A painting as a feature network on its device sees it, with these settings."""
-        image = style.image.to(next(style.backbone.parameters()).device)
+        image = style.painting.pixels.to(next(style.backbone.parameters()).device)
         losses = [name for name, weight in self.loss_weights.items() if weight > 0]
         side = self.style_side or self.feature_side
         return StyleTargets(style.backbone, image, self.feature_side, side, self.style_features, losses)
@@ -173,7 +173,7 @@ class HierStylePipeline(CheckedPipeline):
         return self._on_device(replace(self.config, style_image=path).load_style())
 
     def _on_device(self, style: StyleInputs) -> StyleTargets:
-        return self.config.targets_of(StyleInputs(style.image, style.backbone.to(self.device)))
+        return self.config.targets_of(StyleInputs(style.painting, style.backbone.to(self.device)))
 
     def warm_start_loss(self, task: StyleTask, step: int) -> Dict[str, Float[Tensor, ""]]:
         """How far c_f, on the coarse geometry, is from the content picture of one photo.

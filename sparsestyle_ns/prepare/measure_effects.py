@@ -12,7 +12,7 @@ from sparsestyle_ns.effects.registry import ALL_AUTO, decide
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
 from sparsestyle_ns.runs.scene_record import record_scene
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 
 
@@ -49,5 +49,5 @@ def measure_scene(
         check_scene(run, record_scene(manager))
         scene.coarse_density = run.density(manager.effects)
     if style_image is not None:
-        scene.style_image = load_style_image(style_image)
+        scene.style_image = Painting.read(style_image).pixels
     return decide(scene, ALL_AUTO, manager.effects)

@@ -50,7 +50,7 @@ class CoarseRun:
     def density(self, effects: Decisions) -> Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]:
         """σ_c at field coordinates, as a function; `effects` are those that the run was made with."""
         with torch.random.fork_rng(devices=[]):  # what is made after it starts as it would without
-            field = self.config.pipeline.model.coarse_field.setup(effects).requires_grad_(False)
+            field = self.config.pipeline.model.coarse_field.setup(effects.on("view_color")).requires_grad_(False)
         field.load_state_dict(under(self.model_state(), "field."))
         return lambda points: field.density_and_feature(points)[0]
 

@@ -20,7 +20,8 @@ from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingS
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import EffectSettings
-from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig, CoarseFieldConfig
+from sparsestyle_ns.fields.coarse import CoarseFieldConfig
+from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
 from sparsestyle_ns.models.hier_style import HierStyleModelConfig
 from sparsestyle_ns.pipelines import base as pipelines
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig

@@ -18,7 +18,7 @@ from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.style.color import color_moments, gaussian_distance
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.style.painting import Painting
 
 SEEDS = (0, 1, 2)
 """Short trainings of one scene with different seeds differ by up to a decibel, so means over some are compared."""
@@ -177,7 +177,7 @@ def test_residual_density_lets_the_style_change_a_hazy_scene(scenes, painting):
 def test_palette_transfer_brings_held_out_views_to_the_colours_of_the_painting(scenes, painting):
     folder = scenes("llff")
     coarse = trained_coarse(folder, "llff", 150, {}).model.state_dict()
-    aim = color_moments(load_style_image(painting).flatten(1).T)
+    aim = color_moments(Painting.read(painting).pixels.flatten(1).T)
     distances = []
     for choice in ("on", "off"):
         pipeline = trained_style(folder, "llff", painting, coarse, 60, {"palette": choice})

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -135,8 +136,9 @@ def view():
     return View("view", picture, picture)
 
 
-def test_the_viewer_shows_the_table() -> None:
-    shown = []
-    gui = SimpleNamespace(add_markdown=lambda text, visible: shown.append(text))
-    EffectsPanel(decided("box").markdown).install(SimpleNamespace(gui=gui))
-    assert len(shown) == 1 and "| box | on |" in shown[0]
+def test_the_viewer_lists_every_effect() -> None:
+    gui = MagicMock()
+    viewer = SimpleNamespace(viser_server=SimpleNamespace(gui=gui))
+    EffectsPanel(SimpleNamespace(effects=decided("box")))._setup(viewer)
+    (shown,) = (call.args[0] for call in gui.add_markdown.call_args_list)
+    assert "**box** on: " in shown and len(shown.split("\n\n")) == len(EFFECTS)

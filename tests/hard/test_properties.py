@@ -41,10 +41,10 @@ from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.losses import content, geometry, nnfm, reconstruction, semantic, style_index
 from sparsestyle_ns.losses import stylization as targets
-from sparsestyle_ns.rendering import baked, frozen_view, mixing
+from sparsestyle_ns.rendering import baked, frozen_view, mixing, visible_samples
 from sparsestyle_ns.rendering import render as volume
 from sparsestyle_ns.style import backbones, color
-from sparsestyle_ns.style import painting as image
+from sparsestyle_ns.style.painting import Painting
 
 PACKAGES = [
     sparsestyle_ns.core,
@@ -324,12 +324,14 @@ def tiny_fields(seed, bias):
 @covers(
     volume.render_coarse,
     volume.freeze_samples,
-    volume.visible_samples,
-    volume.evaluate_front_to_back,
+    visible_samples.visible_samples,
+    visible_samples.evaluate_front_to_back,
     volume.accumulation_of,
     volume.render_packed,
     volume.render_stylised,
     volume.render_mixed,
+    volume.surface_distance,
+    baked.shade_of,
     precision.autocast,
     precision.multiplies_bfloat16,
     precision.multiplies_tf32,
@@ -353,9 +355,8 @@ def test_renders_of_any_field_are_pictures(seed, scene, rays, steps, bias, numbe
     with precision.autocast(origins.device, number_format):
         edges = sampling.even_edges(len(origins), steps, origins.device)
         coarse = volume.render_coarse(field, segments, directions, edges, layout.unbounded, background)
-        frozen = volume.freeze_samples(
-            field, residual, density_grid.Occupancy(2), segments, steps, layout.unbounded, min_transmittance=1e-3
-        )
+        marching = visible_samples.Marching(density_grid.Occupancy(2), steps, layout.unbounded, 1e-3)
+        frozen = volume.freeze_samples(field, residual, segments, marching)
         stylised = volume.render_stylised(residual, frozen, background)
         also, again = volume.render_mixed(field, [residual], frozen, directions, background)
     (coarse.rgb.square().sum() + stylised.rgb.square().sum()).backward()
@@ -363,6 +364,10 @@ def test_renders_of_any_field_are_pictures(seed, scene, rays, steps, bias, numbe
     for render in (coarse, stylised, again):
         assert (render.rgb >= -1e-6).all() and (render.rgb <= 1 + 1e-5).all()
         assert (render.accumulation <= 1 + 1e-6).all() and (render.s >= 0).all() and (render.s <= 1 + 1e-5).all()
+        depth = volume.surface_distance(segments, render.s)
+        assert depth.isfinite().all() and (depth >= 0).all()
+    shaded = baked.shade_of(field, residual, layout, number_format)(2 * torch.rand(5, 3) - 1)
+    assert (shaded >= 0).all() and (shaded[:, 2:] <= 1).all()
     torch.testing.assert_close(volume.accumulation_of(frozen), again.accumulation)
     # What lies behind 1e-3 of the light is left out; bfloat16 rounds logits at the samples of one render alone.
     if number_format in ("float32", "tf32"):
@@ -395,10 +400,10 @@ def test_baked_renders_are_pictures(seed, scene, rays, steps, resolution):
         density = torch.exp(3 * logs + (4 * points).sin().sum(dim=-1, keepdim=True))
         return torch.cat([density, (points.repeat(1, 2) + 1) / 2], dim=-1)
 
-    batch = baked.Rays(segments, density_grid.Occupancy(2), steps, layout.unbounded, 1e-3)
+    marching = visible_samples.Marching(density_grid.Occupancy(2), steps, layout.unbounded, 1e-3)
     device = torch.device("cpu")
-    compiled = baked.render_baked(baked.BakedVolume(shade, resolution, device), batch, torch.ones(3))
-    plain = baked.march_in_torch(baked.BakedVolume(shade, resolution, device), batch, torch.ones(3))
+    compiled = baked.render_baked(baked.BakedVolume(shade, resolution, device), segments, marching, torch.ones(3))
+    plain = baked.march_in_torch(baked.BakedVolume(shade, resolution, device), segments, marching, torch.ones(3))
     for left, right in zip(compiled, plain, strict=True):
         assert (left.rgb >= -1e-6).all() and (left.rgb <= 1 + 1e-5).all()
         # A sample within rounding of a cell's border, or of 1e-3 of the light, may count in one of them alone.
@@ -640,28 +645,21 @@ def test_transferred_colours_have_the_styles_mean(data, count, style_count, dtyp
     assert (cut >= 0).all() and (cut <= 1).all()
 
 
-@covers(image.load_style_image, image.read_bytes, image.decode_style_image)
 @given(
     arrays.arrays(
         st.sampled_from([np.uint8, np.uint16]),
         st.tuples(st.integers(8, 20), st.integers(8, 20)),
         elements=st.integers(0, 255),
-    ),
-    st.sampled_from([None, 8, 15, 64]),
+    )
 )
-def test_pictures_are_read_as_they_were_written(tmp_path_factory, pixels, max_side):
+def test_pictures_are_read_as_they_were_written(tmp_path_factory, pixels):
     path = tmp_path_factory.mktemp("pictures") / "picture.png"
     Image.fromarray(pixels).save(path)
-    largest = np.iinfo(pixels.dtype).max
-    assume(max_side is None or min(pixels.shape) * max_side >= 8 * max(pixels.shape))
-    read = image.load_style_image(path, max_side)
-    assert read.dtype == torch.float32 and read.min() >= 0 and read.max() <= 1
-    assert torch.equal(image.decode_style_image(image.read_bytes(path), path.name, max_side), read)
-    if max_side is None:
-        expected = torch.from_numpy(pixels.astype(np.float32) / largest)
-        torch.testing.assert_close(read, expected.expand(3, -1, -1))
-    else:
-        assert max(read.shape) <= max(3, max_side)
+    read = Painting.read(path)
+    assert read.pixels.dtype == torch.float32 and read.pixels.min() >= 0 and read.pixels.max() <= 1
+    assert torch.equal(Painting.received(path.name, path.read_bytes()).pixels, read.pixels)
+    expected = torch.from_numpy(pixels.astype(np.float32) / np.iinfo(pixels.dtype).max)
+    torch.testing.assert_close(read.pixels, expected.expand(3, -1, -1))
 
 
 @pytest.fixture(scope="module")
