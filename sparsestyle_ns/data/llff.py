@@ -27,7 +27,8 @@ from torch.nn import functional as F
 
 from sparsestyle_ns.core.ndc import ndc_rays
 from sparsestyle_ns.data.parser_choice import advice
-from sparsestyle_ns.data.photos import check_one_size, open_photo, photo_size
+from sparsestyle_ns.data.photos import check_one_size, is_scaled, open_photo, photo_size
+from sparsestyle_ns.data.scene_info import NDC, SCENE_INFO, SceneInfo
 from sparsestyle_ns.utils.errors import InputError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -35,6 +36,8 @@ NDC_NEAR = 1.0
 """Distance of NDC's near plane in the scaled world."""
 DEPTH_MARGIN = 0.1
 """Share by which the bounds of depth are widened: LLFF's are percentiles of sparse points."""
+USUAL_NUM_VIEWS = 3
+"""Views to train on by default (RegNeRF's); a folder with no more of them than `eval_interval` is trained on whole."""
 BOX_MARGIN = 0.05
 """How far the scene box reaches beyond what the cameras see, on each side, as a part of its width."""
 
@@ -71,23 +74,14 @@ class LLFFCameras(NamedTuple):
     """Distances along the viewing direction of the nearest and the farthest thing seen."""
 
 
-@dataclass
 class LLFFDataParser(DataParser):
     """Reads an LLFF folder.
 
-    The outputs' `metadata` tells the model and the datamanager what nerfstudio has no field for:
-
-    - `space`: "ndc": the scene box is in NDC, and rays are to be mapped there (`rendering/ndc.py`);
-    - `ndc_focal_over_half_size`: (2f/w, 2f/h), and `ndc_near`: 1.0, the arguments of that map;
-    - `view_ids` and `view_names`: which of the sorted images this split has, and their file names;
-    - `ndc_depth_range`: depth of the nearest and the farthest thing that any view sees, with a margin;
-    - `bounds`: [num_views_of_split, 2], near and far bound of each view in the scaled world's units.
+    The `SceneInfo` in the outputs' metadata has the map to NDC, with bounds of depth that are widened by
+    `DEPTH_MARGIN`; a view's id is its place among the sorted images.
     """
 
     config: LLFFDataParserConfig
-
-    def __init__(self, config: LLFFDataParserConfig):
-        super().__init__(config=config)
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         """Reads the folder and returns one split of it: "train", or "val" and "test", which are the held-out views.
@@ -111,6 +105,8 @@ class LLFFDataParser(DataParser):
         focal = focals.mean().item()
         focal_over_half_size = (2 * focal / width, 2 * focal / height)
 
+        depths = depth_range(scale * llff_cameras.bounds)
+
         view_ids = self._view_ids(split, len(filenames))
         cameras = Cameras(
             camera_to_worlds=camera_to_worlds[view_ids].float(),
@@ -128,16 +124,12 @@ class LLFFDataParser(DataParser):
             scene_box=ndc_scene_box(camera_to_worlds, focals, (width, height), focal_over_half_size, filenames),
             dataparser_scale=scale,
             dataparser_transform=transform.float(),
-            metadata={
-                "space": "ndc",
-                "ndc_focal_over_half_size": focal_over_half_size,
-                "ndc_near": NDC_NEAR,
-                "ndc_depth_range": depth_range(scale * llff_cameras.bounds),
-                "view_ids": view_ids,
-                "view_names": [filenames[i].name for i in view_ids],
-                "bounds": (scale * llff_cameras.bounds[view_ids]).float(),
-            },
+            metadata={SCENE_INFO: self._scene_info(view_ids, NDC(focal_over_half_size, NDC_NEAR, depths))},
         )
+
+    def _scene_info(self, view_ids: List[int], ndc: NDC) -> SceneInfo:
+        few = len(view_ids) <= self.config.eval_interval
+        return SceneInfo(tuple(view_ids), ndc, default_num_views=len(view_ids) if few else USUAL_NUM_VIEWS)
 
     def _check_settings(self) -> None:
         if self.config.eval_interval < 2:
@@ -297,20 +289,13 @@ def read_image_size(filenames: List[Path], full_sizes: Float[Tensor, "num_views 
     check_one_size(filenames)
     width, height = photo_size(filenames[0])
     for filename, full_size in zip(filenames, full_sizes.tolist(), strict=True):
-        if not _same_aspect((width, height), full_size):
+        if not is_scaled((width, height), full_size):
             raise InputError(
                 f"{filename} is {width}x{height} pixels, which is no scaled version of the "
                 f"{full_size[0]:g}x{full_size[1]:g} that poses_bounds.npy was made for: scale the original photos "
                 "without cropping or turning them."
             )
     return width, height
-
-
-def _same_aspect(size: Tuple[int, int], full_size: Tuple[float, float]) -> bool:
-    """Whether one factor takes both sides of `full_size` to less than a pixel from `size`."""
-    least = max((side - 1) / full_side for side, full_side in zip(size, full_size, strict=True))
-    most = min((side + 1) / full_side for side, full_side in zip(size, full_size, strict=True))
-    return least < most
 
 
 def recentring_transform(camera_to_worlds: Float[Tensor, "num_views 3 4"]) -> Float[Tensor, "3 4"]:

@@ -84,6 +84,15 @@ def check_one_size(filenames: Sequence[Path]) -> None:
             )
 
 
+def is_scaled(size: Tuple[float, float], original: Tuple[float, float]) -> bool:
+    """Whether an image of this width and height may be a scaled version of another.
+
+    One factor has to take both sides of `original` to less than a pixel from `size`, as sides are rounded up or down.
+    """
+    (width, height), (full_width, full_height) = size, original
+    return abs(width * full_height - height * full_width) < full_width + full_height
+
+
 def at_size(cameras: Cameras, width: Int[Tensor, "views 1"], height: Int[Tensor, "views 1"]) -> Cameras:
     """The same cameras for images of another size: each pixel's ray goes to what that pixel shows.
 

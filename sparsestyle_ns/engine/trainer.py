@@ -137,7 +137,8 @@ class SparseStyleTrainer(Trainer, ABC):
 
     @check_main_thread
     def _save_record(self) -> None:
-        record_scene(self.pipeline.datamanager).save(self.base_dir)
+        manager = self.pipeline.datamanager
+        record_scene(manager.config.data, manager.train_dataparser_outputs, self.pipeline.effects).save(self.base_dir)
         self.save_decisions()
 
     def save_decisions(self) -> None:
@@ -441,10 +442,11 @@ class HierStyleTrainer(SparseStyleTrainer):
         run = None
         if not resumes:
             manager = self._photos()
-            run = self.coarse_run(manager)
+            decided = decide(manager.scene, pipeline.effects)
+            run = self.coarse_run(manager, decided)
             self.config.pipeline.coarse_run = run.folder.resolve()
             self.config.pipeline.model.coarse_field = copy.deepcopy(run.config.pipeline.model.coarse_field)
-            self.config.pipeline.decided = self._decide(manager, run)
+            self.config.pipeline.decided = self._decide(manager, run, decided)
         self._coarse_state = None if run is None else run.model_state()
         super().setup(test_mode)
         self.config.pipeline.backbone = self.pipeline.targets.backbone.description.name
@@ -505,16 +507,17 @@ class HierStyleTrainer(SparseStyleTrainer):
         if pipeline.backbone == "auto" and pipeline.vgg_weights is None:
             pipeline.backbone = state["backbone"]["name"]
 
-    def coarse_run(self, manager: FewShotDataManager) -> CoarseRun:
+    def coarse_run(self, manager: FewShotDataManager, decided: Decisions) -> CoarseRun:
         """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now.
 
         Args:
-            manager: the photos, with what was decided about them.
+            manager: the photos.
+            decided: what was decided about them.
 
         Raises:
             InputError: the run that was asked for doesn't exist or is of another scene.
         """
-        scene = record_scene(manager)
+        scene = record_scene(manager.config.data, manager.train_dataparser_outputs, decided)
         asked = self.config.pipeline.coarse_run
         if asked is not None:
             run = read_coarse_run(asked)
@@ -528,19 +531,18 @@ class HierStyleTrainer(SparseStyleTrainer):
             CONSOLE.print(f"Stylising the newest coarse run of this scene, {found.folder}.")
             return found
         CONSOLE.print("There is no finished coarse run of this scene and these views; training one first.")
-        return self._train_coarse(methods[-1], manager.effects)
+        return self._train_coarse(methods[-1], decided)
 
     def _photos(self) -> FewShotDataManager:
         config = copy.deepcopy(self.config.pipeline.datamanager)
-        config.effects = self.config.pipeline.effects
         return config.setup(device="cpu", test_mode="inference")
 
-    def _decide(self, manager: FewShotDataManager, run: CoarseRun) -> Decisions:
+    def _decide(self, manager: FewShotDataManager, run: CoarseRun, decided: Decisions) -> Decisions:
         """What is simulated: as in the coarse run, and the rest by its field and the painting."""
         settings, scene = self.config.pipeline, manager.scene
-        scene.coarse_density = run.density(manager.effects)
+        scene.coarse_density = run.density(decided)
         scene.style_image = load_style_image(settings.style_image)
-        return decide(scene, settings.effects, manager.effects)
+        return decide(scene, settings.effects, decided)
 
     def _train_coarse(self, method: str, decided: Decisions) -> CoarseRun:
         from sparsestyle_ns.method_configs import method_config

@@ -8,7 +8,7 @@ from typing import Any, Callable, Dict, Iterator, List, Literal, Optional, Tuple
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor, nn
 from torch.nn import Parameter
 
@@ -23,6 +23,7 @@ from sparsestyle_ns.fields.fine_tuned import FineTunedField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.metrics.image import image_metrics
 from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
+from sparsestyle_ns.models.scene_model import SceneModel
 from sparsestyle_ns.rendering.baked import BakedVolume, Rays, render_baked
 from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
 from sparsestyle_ns.rendering.mixing import STYLISED, Mix
@@ -126,29 +127,24 @@ class Look:
     styles: Optional[Tuple[nn.Module, ...]] = None
 
 
-class HierStyleModel(Model):
+class HierStyleModel(SceneModel):
     """(σ_f, c_f) on top of a frozen (σ_c, e_c, c_c). Its state holds all that rendering needs."""
 
     config: HierStyleModelConfig
 
     def populate_modules(self) -> None:
-        """Builds both fields, the space, and what the scene's effects need."""
+        """Builds both fields, and the grid that says what is empty."""
         super().populate_modules()
-        metadata: Dict[str, Any] = self.kwargs["metadata"]
-        effects: Decisions = metadata["effects"]
-        config = self.config
+        effects, config = self.effects, self.config
         if config.fine_encoding == "auto":  # kept in the config, so that a run is opened as what it was trained as
             is_there = has_tiny_cuda_nn(self._built_for(), config.features_per_level)
             config.fine_encoding = "tiny-cuda-nn" if is_there else "hash"
-        self.space = effects.build_space(scene_box=self.scene_box, metadata=metadata)
         self.field = config.coarse_field.setup(effects).requires_grad_(False)
         residual = config.stylised_field == "residual"
         self.residual = self._residual_field(effects) if residual else self._fine_tuned_field(effects)
-        self.occupancy = effects.build("empty_space", grid=Occupancy, resolution=config.occupancy_resolution)
-        self.exposure = effects.build("exposure", num_photos=self.num_train_data)
+        self.occupancy = Occupancy(config.occupancy_resolution) if effects.on("empty_space") else None
         if self.exposure is not None:
             self.exposure.requires_grad_(False)
-        self.register_buffer("background", effects.build("background"), persistent=False)
         self.look = Look(config.render_mode, self._configured_mix())
         self.viewer_look: Callable[[], Optional[Look]] = lambda: None
         self._baked: Dict[nn.Module, Tuple[BakedVolume, List[Tensor]]] = {}
@@ -164,10 +160,9 @@ class HierStyleModel(Model):
 
     def new_style(self) -> nn.Module:
         """A field to be stylised, as it is before training, on the model's device."""
-        effects: Decisions = self.kwargs["metadata"]["effects"]
         if self.config.stylised_field == "residual":
-            return self._residual_field(effects).to(self.device)
-        style = self._fine_tuned_field(effects).to(self.device)
+            return self._residual_field(self.effects).to(self.device)
+        style = self._fine_tuned_field(self.effects).to(self.device)
         style.field.load_state_dict(self.field.state_dict())
         return style
 

@@ -24,7 +24,7 @@ from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfi
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.render import accumulation_of, seen_behind
-from sparsestyle_ns.style.color import apply_palette, color_moments
+from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
 from sparsestyle_ns.style.painting import load_style_image
 from sparsestyle_ns.style.vgg import VGGFeatures
 from sparsestyle_ns.utils.distributed import average_gradients, gather_rays, num_processes, shard_rays
@@ -234,7 +234,7 @@ class HierStylePipeline(CheckedPipeline):
             self.scene_views = self._freeze_views()
         pictures = [view.picture for view in self.scene_views]
         if effects.on("palette"):
-            pictures = self._in_style_colors(pictures, targets, effects)
+            pictures = self._in_style_colors(pictures, targets)
         return [
             ContentView(
                 view.frozen,
@@ -317,13 +317,13 @@ class HierStylePipeline(CheckedPipeline):
         between = [pose for place, pose in enumerate(path) if place % steps]
         return [at_poses(pose[None], cameras) for pose in between[: self.config.novel_views]]
 
-    def _in_style_colors(self, pictures: List[Tensor], targets: StyleTargets, effects: Decisions) -> List[Tensor]:
+    def _in_style_colors(self, pictures: List[Tensor], targets: StyleTargets) -> List[Tensor]:
         """Pictures with the painting's colours; where the scene is transparent the background stays as it is."""
         photos, weights = len(self.datamanager.pixels.sizes), [view.accumulation for view in self.scene_views]
         colors = torch.cat([picture.reshape(-1, 3) for picture in pictures[:photos]])
         weight = torch.cat([weight.reshape(-1) for weight in weights[:photos]])
         style = color_moments(targets.style_image.permute(1, 2, 0).reshape(-1, 3))
-        matrix, offset = effects.build("palette", content=color_moments(colors, weight), style=style)
+        matrix, offset = palette_transform(*color_moments(colors, weight), *style)
         transferred = [apply_palette(picture, matrix, offset, clamp=True) for picture in pictures]
         if self.model.background is None:
             return transferred

@@ -12,7 +12,7 @@ from conftest import TINY, TINY_STYLE, decided, ns_train, only_run
 import sparsestyle_ns.pipelines.datamanager as datamanager
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.exposure import ExposureCorrection
-from sparsestyle_ns.effects.registry import EFFECTS
+from sparsestyle_ns.effects.registry import EFFECTS, decided_on_photos
 from sparsestyle_ns.gallery.page import RunPictures, gallery_page
 from sparsestyle_ns.runs.coarse_run import newest_checkpoint
 from sparsestyle_ns.runs.run_folder import find_config, load_run
@@ -51,7 +51,7 @@ def test_a_loaded_run_has_what_was_decided_and_measures_nothing(
 
 def test_a_stylised_run_takes_over_what_photos_decided_and_measures_the_rest(runs: SimpleNamespace) -> None:
     coarse, style = decisions_of(runs.coarse), decisions_of(runs.style)
-    assert [coarse[name] for name in coarse.on_photos()] == [style[name] for name in coarse.on_photos()]
+    assert [coarse[name] for name in decided_on_photos(coarse)] == [style[name] for name in decided_on_photos(coarse)]
     for name in ("empty_space", "residual_density", "palette"):
         assert coarse[name].measured is None and style[name].measured is not None
 
