@@ -6,6 +6,8 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, List, Optional, Sequence, Union
 
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+
 from sparsestyle_ns.utils.progress import say
 
 PAINTING = "PAINTING.jpg"
@@ -45,7 +47,7 @@ def after_evaluation(run: Path, stylised: bool) -> List[str]:
 
 
 def after_effects(
-    dataparser: str,
+    dataparser: DataParserConfig,
     data: Path,
     num_views: Optional[int],
     view_ids: Optional[Sequence[int]],
@@ -58,7 +60,7 @@ def after_effects(
         painting = PAINTING if style_image is None else str(style_image)
         command = ["ns-train", "hier-style", "--style-image", painting, "--coarse-run", str(coarse_run)]
     command += _flag("--num-views", num_views, None) + _flag("--view-ids", view_ids, None)
-    return [*command, "--data", str(data), dataparser]
+    return [*command, "--data", str(data), *_parser(dataparser)]
 
 
 def after_tradeoff(options: Any) -> List[str]:

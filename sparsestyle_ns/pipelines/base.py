@@ -31,7 +31,7 @@ class CheckedPipelineConfig(VanillaPipelineConfig):
 
     datamanager: DataManagerConfig = field(default_factory=FewShotDataManagerConfig)
     """The photos."""
-    effects: EffectSettings = EffectSettings()
+    effects: EffectSettings = field(default_factory=EffectSettings)
     """Which effects are simulated; auto measures whether the scene calls for them."""
     decided: tyro.conf.Suppress[Optional[Decisions]] = None
     """What was decided, with its reasons; a loaded run has it and measures nothing."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from sparsestyle_ns.data.llff import read_poses_bounds
 from sparsestyle_ns.data.transforms import check_lenses, read_transforms
-from sparsestyle_ns.prepare.photos import MIN_PHOTOS, Framing, Size
+from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, Size
 from sparsestyle_ns.utils.errors import InputError
 
 POSES_BOUNDS, TRANSFORMS = "poses_bounds.npy", "transforms.json"

@@ -7,13 +7,13 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
+from sparsestyle_ns.data.features import mutual_matches
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.data.matches import (
     LENSES,
     PointMatches,
     distances_along,
     epipolar_error,
-    mutual_matches,
     rays_of,
     sample,
     undistorted,
@@ -120,7 +120,7 @@ def test_of_other_cameras_effects_say_that_nothing_is_measured():
 def test_only_the_nearest_neighbours_of_each_other_match_and_only_where_they_stand_out():
     first = np.eye(4)[:3]
     second = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0.02, 0, 0.7, 0.71], [0, 0, 0.71, 0.7]])
-    here, there = mutual_matches(first, second / np.linalg.norm(second, axis=1, keepdims=True))
+    here, there = mutual_matches(first, second / np.linalg.norm(second, axis=1, keepdims=True), max_ratio=0.8)
     assert (here.tolist(), there.tolist()) == ([0, 1], [1, 0])
 
 

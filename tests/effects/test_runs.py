@@ -9,7 +9,6 @@ import torch
 import yaml
 from conftest import TINY, TINY_STYLE, decided, ns_train, only_run
 
-import sparsestyle_ns.pipelines.datamanager as datamanager
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.exposure import ExposureCorrection
 from sparsestyle_ns.effects.registry import EFFECTS, decided_on_photos
@@ -40,7 +39,7 @@ def refuse(*arguments: object) -> None:
 def test_a_loaded_run_has_what_was_decided_and_measures_nothing(
     runs: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.setattr(datamanager, "decide", refuse)
+    monkeypatch.setattr(base, "decide", refuse)
     for run in (runs.coarse, runs.style):
         _, pipeline, _ = load_run(find_config(run))
         saved = decisions_of(run)

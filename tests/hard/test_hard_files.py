@@ -21,7 +21,7 @@ from sparsestyle_ns.data.llff import LLFFDataParserConfig, read_poses_bounds
 from sparsestyle_ns.data.photos import open_photo, photo_size
 from sparsestyle_ns.data.view_selection import select_views
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
-from sparsestyle_ns.prepare.photos import frame_photos
+from sparsestyle_ns.prepare.framing import frame_photos
 from sparsestyle_ns.prepare.poses import TransformsPoses, fits
 from sparsestyle_ns.style.painting import load_style_image
 from sparsestyle_ns.utils.errors import InputError
