@@ -3,7 +3,7 @@
 import copy
 from collections import Counter
 from pathlib import Path
-from typing import Any, Dict, Literal, Sequence, Tuple
+from typing import Any, Dict, List, Literal, Sequence, Tuple
 
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -20,6 +20,15 @@ SMALLEST_SIDE = 8
 """Pixels a side below which a photo shows nothing."""
 DARKEST = 3
 """Of 255: a photo with nothing brighter is black, but for the noise of its compression."""
+
+
+def images_in(folder: Path, suffixes: Sequence[str]) -> List[Path]:
+    """The files in a folder with one of these suffixes, sorted by name; hidden files are passed over."""
+    return sorted(
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in suffixes and not path.name.startswith(".") and path.is_file()
+    )
 
 
 def open_photo(path: Path, draft: bool = False) -> Image.Image:
@@ -82,15 +91,6 @@ def check_one_size(filenames: Sequence[Path]) -> None:
                 f"{filename} is {size[0]}x{size[1]} pixels, but the other images are {usual[0]}x{usual[1]}: bring all "
                 "of them to one size."
             )
-
-
-def is_scaled(size: Tuple[float, float], original: Tuple[float, float]) -> bool:
-    """Whether an image of this width and height may be a scaled version of another.
-
-    One factor has to take both sides of `original` to less than a pixel from `size`, as sides are rounded up or down.
-    """
-    (width, height), (full_width, full_height) = size, original
-    return abs(width * full_height - height * full_width) < full_width + full_height
 
 
 def at_size(cameras: Cameras, width: Int[Tensor, "views 1"], height: Int[Tensor, "views 1"]) -> Cameras:

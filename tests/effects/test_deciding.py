@@ -238,6 +238,13 @@ def test_the_settings_are_the_effects_in_order():
     assert [field.name for field in dataclasses.fields(EffectSettings)] == list(EFFECTS)
 
 
+def test_the_command_takes_a_dataparsers_options_and_hands_them_on(llff_scene, capsys):
+    main(["effects", "--data", str(llff_scene), "--", "llff-data", "--eval-interval", "4"])
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[1].startswith("ndc")
+    assert printed.splitlines()[-1].endswith(f"--data {llff_scene} llff-data --eval-interval 4")
+
+
 def test_an_unknown_dataparser_and_a_missing_folder_are_named(tmp_path):
     for arguments, word in ((["no-data"], "no-data"), (["llff-data"], "nowhere")):
         with pytest.raises(SystemExit, match=word):

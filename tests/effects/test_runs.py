@@ -13,6 +13,7 @@ from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.exposure import ExposureCorrection
 from sparsestyle_ns.effects.registry import EFFECTS, decided_on_photos
 from sparsestyle_ns.gallery.page import RunPictures, gallery_page
+from sparsestyle_ns.pipelines import base as pipelines
 from sparsestyle_ns.runs.coarse_run import newest_checkpoint
 from sparsestyle_ns.runs.run_folder import find_config, load_run
 from sparsestyle_ns.viewer.effects_panel import EffectsPanel
@@ -39,7 +40,7 @@ def refuse(*arguments: object) -> None:
 def test_a_loaded_run_has_what_was_decided_and_measures_nothing(
     runs: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.setattr(base, "decide", refuse)
+    monkeypatch.setattr(pipelines, "decide", refuse)
     for run in (runs.coarse, runs.style):
         _, pipeline, _ = load_run(find_config(run))
         saved = decisions_of(run)
