@@ -26,6 +26,8 @@ from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.spaces import Space
 from sparsestyle_ns.core.volrend import dense_weights, optical_depth
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
+from sparsestyle_ns.effects.base import EffectSettings
+from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
@@ -132,7 +134,9 @@ def find_or_train_coarse(scene: Scene, options: Options) -> CoarseRun:
     usual = 20 if options.quick else method_config(COARSE_METHOD).max_num_iterations
     iterations = str(options.coarse_iterations or usual)
     folder = CACHE / "coarse" / ("-".join([scene.name, iterations] + ["quick"] * options.quick))
-    record = record_scene(load_photos(scene))
+    manager = load_photos(scene)
+    effects = decide(manager.scene, EffectSettings())
+    record = record_scene(scene.folder, manager.train_dataparser_outputs, effects)
     found = find_coarse_run(folder, [COARSE_METHOD], record)
     if found is None:
         print(f"Training a coarse run of {iterations} iterations, once; it is kept in {folder}", flush=True)

@@ -113,35 +113,40 @@ def evaluate(
 
 @exit_on_input_error
 def effects(
-    dataparser: Annotated[str, tyro.conf.Positional],
     data: Path,
+    dataparser: Annotated[Tuple[str, ...], tyro.conf.Positional] = (),
     json: bool = False,
     num_views: Optional[int] = None,
     view_ids: Optional[Tuple[int, ...]] = None,
     coarse_run: Optional[Path] = None,
     style_image: Optional[Path] = None,
 ) -> None:
-    """Prints which effects a scene calls for, and why, without training.
+    """Prints which effects a scene needs, and why, without training.
+
+    Each effect has what was measured, the threshold it was compared with, and the reason.
 
     Args:
-        dataparser: What reads the scene: llff-data, blender-data, nerfstudio-data, colmap or another of nerfstudio's.
         data: The scene's folder or file.
+        dataparser: What reads the scene, where its files don't tell: llff-data, blender-data, nerfstudio-data, colmap
+            …; its options come after two dashes: -- colmap --colmap-path sparse/0.
         json: Print JSON: a list `effects` of name, on, measured, threshold, reason.
         num_views: How many photos to train on, as for ns-train.
         view_ids: Which photos to train on, as for ns-train.
-        coarse_run: A coarse run of the scene, on which the effects of stage 2 are measured.
-        style_image: The painting, with which the photos' palette is compared.
+        coarse_run: A coarse run of the scene, to measure the effects of stage 2; left out, they are assumed.
+        style_image: The painting, to compare its palette with the photos'.
     """
     from contextlib import redirect_stdout
 
+    from sparsestyle_ns.data.parser_choice import parse_dataparser
     from sparsestyle_ns.engine.hints import after_effects, finish
     from sparsestyle_ns.prepare.measure_effects import measure_scene
 
-    with redirect_stdout(sys.stderr):  # what dataparsers have to say must not get into the JSON
-        decisions = measure_scene(dataparser, data, num_views, view_ids, coarse_run, style_image)
+    parser = parse_dataparser(dataparser, data)
+    with redirect_stdout(sys.stderr):  # what dataparsers print must not get into the JSON
+        decisions = measure_scene(parser, data, num_views, view_ids, coarse_run, style_image)
     print(decisions.json() if json else decisions.text(), flush=True)
     with redirect_stdout(sys.stderr if json else sys.stdout):
-        finish(None, after_effects(dataparser, data, num_views, view_ids, coarse_run, style_image))
+        finish(None, after_effects(parser, data, num_views, view_ids, coarse_run, style_image))
 
 
 @exit_on_input_error
@@ -370,21 +375,21 @@ def prepare(
     output: Path,
     poses: Literal["auto", "file", "colmap"] = "auto",
 ) -> None:
-    """Makes a scene of three to eight photos: of one size, and with the places they were taken from.
+    """Makes a scene of three to eight photos: of one size, and with camera poses.
 
-    Photos are turned upright as EXIF says. With poses from a file they stay as they are stored, which such poses are
-    for, unless only the upright photo has the pose's shape.
+    Photos are turned upright as EXIF says. With poses from a file they stay as they are stored, because such poses are
+    for the stored pixels, unless only the upright photo has the pose's shape.
 
-    Says in words what is wrong with the photos: too few features or matches, too little overlap, a camera that only
-    turned, or only moved along its line of sight.
+    Prints what is wrong with the photos: too few features or matches, too little overlap, a camera that only turned, or
+    that only moved along its line of sight.
 
     Args:
         photos: Folder of the photos: JPEG, PNG, WebP, TIFF, and HEIC where pillow-heif is installed.
         output: Folder to write the scene to.
-        poses: Where the photos were taken from: a poses_bounds.npy or transforms.json beside them (file), as COLMAP
-            works it out (colmap, through ns-process-data), or the file if there is one, else COLMAP (auto).
+        poses: Where the camera poses are from: a poses_bounds.npy or transforms.json beside the photos (file), COLMAP
+            (colmap, through ns-process-data), or the file if there is one, else COLMAP (auto).
     """
-    from sparsestyle_ns.prepare.command import prepare_scene
+    from sparsestyle_ns.prepare.prepare_scene import prepare_scene
 
     scene = prepare_scene(photos, output, poses)
     from sparsestyle_ns.engine.hints import finish

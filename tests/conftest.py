@@ -73,7 +73,7 @@ def coarse_pipeline(scene: Path, **settings: Any) -> "CoarseFewShotPipeline":
     from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
     from sparsestyle_ns.data.llff import LLFFDataParserConfig
-    from sparsestyle_ns.effects.registry import EffectSettings
+    from sparsestyle_ns.effects.base import EffectSettings
     from sparsestyle_ns.fields.coarse import CoarseFieldConfig
     from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
     from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig

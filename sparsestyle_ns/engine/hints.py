@@ -6,9 +6,10 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, List, Optional, Sequence, Union
 
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
-from sparsestyle_ns.effects.registry import ALL_AUTO
+from sparsestyle_ns.effects.base import EffectSettings
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.runs.coarse_run import read_coarse_run
 from sparsestyle_ns.utils.progress import say
@@ -48,7 +49,7 @@ def after_evaluation(run: Path, stylised: bool) -> List[str]:
 
 
 def after_effects(
-    dataparser: str,
+    dataparser: DataParserConfig,
     data: Path,
     num_views: Optional[int],
     view_ids: Optional[Sequence[int]],
@@ -61,7 +62,7 @@ def after_effects(
         painting = PAINTING if style_image is None else str(style_image)
         command = ["ns-train", "hier-style", "--style-image", painting, "--coarse-run", str(coarse_run)]
     command += _flag("--num-views", num_views, None) + _flag("--view-ids", view_ids, None)
-    return [*command, "--data", str(data), dataparser]
+    return [*command, "--data", str(data), *_parser(dataparser)]
 
 
 def after_tradeoff(options: Any) -> List[str]:
@@ -112,7 +113,7 @@ def scene_arguments(config: TrainerConfig) -> List[str]:
     for name in ("num_views", "view_ids"):
         arguments += _flag(f"--{name}", getattr(manager, name), getattr(usual, name))
     arguments += _flag("--max-image-side", manager.max_image_side)  # methods differ in what they do without it
-    arguments += changed_flags(config.pipeline.effects, ALL_AUTO, "pipeline.effects.")
+    arguments += changed_flags(config.pipeline.effects, EffectSettings(), "pipeline.effects.")
     arguments += _flag("--output-dir", config.output_dir, Path("outputs"))
     arguments += _flag("--vis", config.vis, "viewer+tensorboard")
     return [*arguments, "--data", str(manager.data or manager.dataparser.data), *_parser(manager.dataparser)]

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import decide
+from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.engine.hints import scene_arguments
 from sparsestyle_ns.engine.trainer import SparseStyleTrainer, SparseStyleTrainerConfig
 from sparsestyle_ns.engine.training_step import warm_start
@@ -76,11 +77,12 @@ class HierStyleTrainer(SparseStyleTrainer):
         pipeline.backbone = self._style.backbone.description.name
         if checkpoint is None:
             self._check_encoding(pipeline)
-            manager = self._photos(pipeline)
-            run = self.coarse_run(manager)
+            manager: FewShotDataManager = pipeline.datamanager.setup(device="cpu", test_mode="inference")
+            decided = decide(manager.scene, pipeline.effects)
+            run = self.coarse_run(manager, decided)
             pipeline.coarse_run = run.folder.resolve()
             pipeline.model.coarse_field = copy.deepcopy(run.config.pipeline.model.coarse_field)
-            pipeline.decided = self._decide(manager, run)
+            pipeline.decided = self._decide(manager.scene, run, decided)
             self._coarse_state = run.model_state()
         self.config = replace(self.config, pipeline=pipeline)
         super().setup(test_mode)
@@ -146,16 +148,17 @@ class HierStyleTrainer(SparseStyleTrainer):
         if pipeline.backbone == "auto" and pipeline.vgg_weights is None:
             pipeline.backbone = notes.backbone["name"]
 
-    def coarse_run(self, manager: FewShotDataManager) -> CoarseRun:
+    def coarse_run(self, manager: FewShotDataManager, decided: Decisions) -> CoarseRun:
         """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now.
 
         Args:
-            manager: the photos, with what was decided about them.
+            manager: the photos.
+            decided: what was decided about them.
 
         Raises:
             InputError: the run that was asked for doesn't exist or is of another scene.
         """
-        scene = record_scene(manager)
+        scene = record_scene(manager.config.data, manager.train_dataparser_outputs, decided)
         asked = self.config.pipeline.coarse_run
         if asked is not None:
             run = read_coarse_run(asked)
@@ -169,20 +172,13 @@ class HierStyleTrainer(SparseStyleTrainer):
             CONSOLE.print(f"Stylising the newest coarse run of this scene, {found.folder}.")
             return found
         CONSOLE.print("There is no finished coarse run of this scene and these views; training one first.")
-        return self._train_coarse(manager.effects)
+        return self._train_coarse(decided)
 
-    @staticmethod
-    def _photos(pipeline: HierStylePipelineConfig) -> FewShotDataManager:
-        config = copy.deepcopy(pipeline.datamanager)
-        config.effects = pipeline.effects
-        return config.setup(device="cpu", test_mode="inference")
-
-    def _decide(self, manager: FewShotDataManager, run: CoarseRun) -> Decisions:
+    def _decide(self, scene: Scene, run: CoarseRun, decided: Decisions) -> Decisions:
         """What is simulated: as in the coarse run, and the rest by its field and the painting."""
-        scene = manager.scene
-        scene.coarse_density = run.density(manager.effects)
+        scene.coarse_density = run.density(decided)
         scene.style_image = self._style.painting.pixels
-        return decide(scene, self.config.pipeline.effects, manager.effects)
+        return decide(scene, self.config.pipeline.effects, decided)
 
     def _train_coarse(self, decided: Decisions) -> CoarseRun:
         config, ours = self.config.coarse_method(), self.config

@@ -19,8 +19,7 @@ from nerfstudio.utils.decorators import check_main_thread, check_viewer_enabled
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.effects.registry import EffectSettings
+from sparsestyle_ns.effects.base import Decisions, EffectSettings
 from sparsestyle_ns.engine.hints import finish, resume_command
 from sparsestyle_ns.engine.previews import preview_steps, render_preview, save_preview
 from sparsestyle_ns.engine.training_step import check_skipped, training_step
@@ -120,7 +119,8 @@ class SparseStyleTrainer(Trainer, ABC):
 
     @check_main_thread
     def _save_record(self) -> None:
-        record_scene(self.pipeline.datamanager).save(self.base_dir)
+        manager = self.pipeline.datamanager
+        record_scene(manager.config.data, manager.train_dataparser_outputs, self.pipeline.effects).save(self.base_dir)
         self.save_decisions()
 
     def save_decisions(self) -> None:

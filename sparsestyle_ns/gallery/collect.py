@@ -177,7 +177,7 @@ def _settings(config: Any, dataset: Any, step: int) -> List[Tuple[str, str]]:
     return [
         ("Method", config.method_name),
         ("Made", config.timestamp),
-        ("Views trained on", ", ".join(map(str, dataset.metadata["view_ids"]))),
+        ("Views trained on", ", ".join(map(str, dataset.metadata["scene_info"].view_ids))),
         ("Photo size in training", f"{width} × {height} pixels"),
         ("Iterations", f"{step + 1} of {config.max_num_iterations}"),
         ("Coarse run", "none" if pipeline.coarse_run is None else pipeline.coarse_run.name),

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 
-from sparsestyle_ns.core.camera_paths import look_one_way, showing_path
+from sparsestyle_ns.core.camera_geometry import is_forward_facing
+from sparsestyle_ns.core.camera_paths import showing_path
 from sparsestyle_ns.gallery.page import Film
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.utils.page import Pixels
@@ -43,7 +44,7 @@ def make_film(model: HierStyleModel, cameras: Cameras, frames: int, longest_side
         for index in track(range(frames), "Filming"):
             outputs = model.get_outputs_for_camera(path[index : index + 1].to(model.device))
             pictures.append(as_pixels(outputs["rgb"].cpu().numpy()))
-    flies = look_one_way(cameras.camera_to_worlds.cpu().float())
+    flies = is_forward_facing(cameras.camera_to_worlds.cpu().float())
     what = "A flight through the photos' viewpoints" if flies else "A turn about the scene"
     return Film(encode_mp4(pictures), f"{what}; baked renders.")
 

@@ -7,18 +7,18 @@ from typing import Any, Dict, List, Optional, Tuple, Type
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
 from sparsestyle_ns.core.occupancy import Occupancy, march
 from sparsestyle_ns.core.precision import Precision, autocast
 from sparsestyle_ns.core.spaces import Segments
-from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.fields.fine import FineFieldConfig, StylisedField
 from sparsestyle_ns.fields.fine_tuned import FineTunedField
 from sparsestyle_ns.metrics.image import image_metrics
+from sparsestyle_ns.models.scene_model import SceneModel
 from sparsestyle_ns.rendering.baked import BakedVolume, shade_of
 from sparsestyle_ns.rendering.baked_cache import BakedCache
 from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
@@ -79,26 +79,21 @@ class HierStyleModelConfig(FineFieldConfig, ModelConfig):
     """Rays rendered at once outside of training."""
 
 
-class HierStyleModel(Model):
+class HierStyleModel(SceneModel):
     """(σ_f, c_f) on top of a frozen (σ_c, e_c, c_c). Its state holds all that rendering needs."""
 
     config: HierStyleModelConfig
 
     def populate_modules(self) -> None:
-        """Builds both fields, the space, and what the scene's effects need."""
+        """Builds both fields, and the grid that says what is empty."""
         super().populate_modules()
-        metadata: Dict[str, Any] = self.kwargs["metadata"]
-        effects: Decisions = metadata["effects"]
-        config = self.config
+        effects, config = self.effects, self.config
         config.settle_encoding(self._built_for())
-        self.space = effects.build_space(scene_box=self.scene_box, metadata=metadata)
         self.field = config.coarse_field.setup(effects.on("view_color")).requires_grad_(False)
         self.residual = self.new_style()
-        self.occupancy = effects.build("empty_space", grid=Occupancy, resolution=config.occupancy_resolution)
-        self.exposure = effects.build("exposure", num_photos=self.num_train_data)
+        self.occupancy = Occupancy(config.occupancy_resolution) if effects.on("empty_space") else None
         if self.exposure is not None:
             self.exposure.requires_grad_(False)
-        self.register_buffer("background", effects.build("background"), persistent=False)
         self.display = Display(Look(config.render_mode, self._configured_mix()))
         self.baked = BakedCache(
             lambda style: self.bake(config.bake_resolution, style),
@@ -115,8 +110,7 @@ class HierStyleModel(Model):
 
     def new_style(self) -> StylisedField:
         """A field to be stylised, as it is before training, on the coarse field's device."""
-        effects: Decisions = self.kwargs["metadata"]["effects"]
-        new = self.config.new_field(self.field, effects.on("residual_density"), self._built_for())
+        new = self.config.new_field(self.field, self.effects.on("residual_density"), self._built_for())
         return new.to(next(self.field.parameters()).device)
 
     def _built_for(self) -> torch.device:

@@ -7,13 +7,14 @@ from typing import Annotated, Any, Callable, Dict, Literal, Optional, Union
 import torch
 import tyro
 from nerfstudio.data.datamanagers.base_datamanager import DataManagerConfig
-from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.pipelines.base_pipeline import Pipeline, VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from torch.amp import GradScaler
 
-from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings
+from sparsestyle_ns.data.scene_info import scene_info
+from sparsestyle_ns.effects.base import Decisions, EffectSettings
+from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.evaluation.held_out import HeldOutReport, evaluate_held_out
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, FewShotDataManagerConfig
@@ -31,7 +32,7 @@ class CheckedPipelineConfig(VanillaPipelineConfig):
 
     datamanager: DataManagerConfig = field(default_factory=FewShotDataManagerConfig)
     """The photos."""
-    effects: EffectSettings = ALL_AUTO
+    effects: EffectSettings = field(default_factory=EffectSettings)
     """Which effects are simulated; auto measures whether the scene calls for them."""
     decided: tyro.conf.Suppress[Optional[Decisions]] = None
     """What was decided, with its reasons; a loaded run has it and measures nothing."""
@@ -55,7 +56,8 @@ class CheckedPipelineConfig(VanillaPipelineConfig):
 class CheckedPipeline(VanillaPipeline):
     """A pipeline that ends with a clear sentence on bad input, and never loads a checkpoint in part.
 
-    It receives what was decided about the scene's effects, or has it decided, and keeps it in its config.
+    It decides which of the scene's effects are simulated, unless its config says so already, and tells the data manager
+    and the model. `config.decided` is the one thing that it writes into its config: a saved run is opened by it.
     """
 
     config: CheckedPipelineConfig
@@ -71,11 +73,22 @@ class CheckedPipeline(VanillaPipeline):
         local_rank: int = 0,
         grad_scaler: Optional[GradScaler] = None,
     ) -> None:
-        config.datamanager.effects, config.datamanager.decided = config.effects, config.decided
-        # However many processes there are, the model is not to be wrapped (see `processes`).
-        super().__init__(config, device, test_mode, 1, local_rank, grad_scaler)
-        config.decided = self.datamanager.effects
-        config.datamanager.decided = None
+        Pipeline.__init__(self)  # VanillaPipeline's would build the model without what is decided
+        self.config, self.test_mode = config, test_mode
+        self.world_size = 1  # however many processes there are, the model is not to be wrapped (see `distributed`)
+        self.datamanager = config.datamanager.setup(device=device, test_mode=test_mode, local_rank=local_rank)
+        self.datamanager.to(device)
+        if config.decided is None:
+            config.decided = decide(self.datamanager.scene, config.effects)
+        self.datamanager.set_effects(config.decided)
+        dataset = self.datamanager.train_dataset
+        self._model = config.model.setup(
+            scene_box=dataset.scene_box,
+            num_train_data=len(dataset),
+            effects=config.decided,
+            ndc=scene_info(self.datamanager.train_dataparser_outputs).ndc,
+            device=device,
+        ).to(device)
         CONSOLE.print("Effects:", self.effects.text(), sep="\n", soft_wrap=True, highlight=False)
         self.panel = None if config.panel is None else config.panel(self)  # nerfstudio's viewer finds it here
         if test_mode != "val":

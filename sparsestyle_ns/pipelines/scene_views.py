@@ -20,7 +20,7 @@ from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.pipelines.datamanager import TrainingPixels
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.render import accumulation_of, seen_behind
-from sparsestyle_ns.style.color import apply_palette, color_moments
+from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
 from sparsestyle_ns.utils.distributed import gather_rays, num_processes, shard_rays
 from sparsestyle_ns.utils.progress import track
 
@@ -127,7 +127,7 @@ class SceneViews:
         """The views with what they must stay like for one painting."""
         pictures = [view.picture for view in self.views]
         if effects.on("palette"):
-            pictures = self._in_style_colors(targets, effects)
+            pictures = self._in_style_colors(targets)
         return [
             ContentView(
                 view.frozen,
@@ -147,13 +147,13 @@ class SceneViews:
             view.features = targets.features(picture)
         return view.features
 
-    def _in_style_colors(self, targets: StyleTargets, effects: Decisions) -> List[Tensor]:
+    def _in_style_colors(self, targets: StyleTargets) -> List[Tensor]:
         """Pictures with the painting's colours; where the scene is transparent the background stays as it is."""
         photos = self.views[: self.num_photos]
         colors = torch.cat([view.picture.reshape(-1, 3) for view in photos])
         weight = torch.cat([view.accumulation.reshape(-1) for view in photos])
         style = color_moments(targets.style_image.permute(1, 2, 0).reshape(-1, 3))
-        matrix, offset = effects.build("palette", content=color_moments(colors, weight), style=style)
+        matrix, offset = palette_transform(*color_moments(colors, weight), *style)
         transferred = [apply_palette(view.picture, matrix, offset, clamp=True) for view in self.views]
         if self.model.background is None:
             return transferred

@@ -13,7 +13,8 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from torch import Tensor
 
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings, decide
+from sparsestyle_ns.effects.base import EffectSettings
+from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.metrics.image import psnr
@@ -148,7 +149,7 @@ def test_the_coarse_field_of_a_made_scene_calls_for_skipping_and_residual_densit
     # In a thick mist all photos are grey: what is learned is solid all over, nothing to skip and nothing doubtful.
     field = pipeline.model.field
     scene = replace(pipeline.datamanager.scene, coarse_density=lambda points: field.density_and_feature(points)[0])
-    decisions = decide(scene, ALL_AUTO)
+    decisions = decide(scene, EffectSettings())
     assert decisions.on("empty_space") is decisions.on("residual_density") is is_on
     assert decisions["empty_space"].measured is not None
 

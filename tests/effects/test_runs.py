@@ -10,12 +10,12 @@ import torch
 import yaml
 from conftest import TINY, TINY_STYLE, decided, ns_train, only_run
 
-import sparsestyle_ns.pipelines.datamanager as datamanager
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.exposure import ExposureCorrection
-from sparsestyle_ns.effects.registry import EFFECTS
+from sparsestyle_ns.effects.registry import EFFECTS, decided_on_photos
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.gallery.page import RunPictures, gallery_page
+from sparsestyle_ns.pipelines import base as pipelines
 from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 from sparsestyle_ns.runs.run_folder import find_config
 from sparsestyle_ns.viewer.effects_panel import EffectsPanel
@@ -42,7 +42,7 @@ def refuse(*arguments: object) -> None:
 def test_a_loaded_run_has_what_was_decided_and_measures_nothing(
     runs: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.setattr(datamanager, "decide", refuse)
+    monkeypatch.setattr(pipelines, "decide", refuse)
     for run in (runs.coarse, runs.style):
         _, pipeline, _ = load_run(find_config(run))
         saved = decisions_of(run)
@@ -53,7 +53,7 @@ def test_a_loaded_run_has_what_was_decided_and_measures_nothing(
 
 def test_a_stylised_run_takes_over_what_photos_decided_and_measures_the_rest(runs: SimpleNamespace) -> None:
     coarse, style = decisions_of(runs.coarse), decisions_of(runs.style)
-    assert [coarse[name] for name in coarse.on_photos()] == [style[name] for name in coarse.on_photos()]
+    assert [coarse[name] for name in decided_on_photos(coarse)] == [style[name] for name in decided_on_photos(coarse)]
     for name in ("empty_space", "residual_density", "palette"):
         assert coarse[name].measured is None and style[name].measured is not None
 

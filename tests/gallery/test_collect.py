@@ -12,7 +12,8 @@ import yaml
 from nerfstudio.cameras.cameras import Cameras
 from PIL import Image
 
-from sparsestyle_ns.core.camera_paths import axes_meet, measuring_path, showing_path
+from sparsestyle_ns.core.camera_geometry import meeting_point
+from sparsestyle_ns.core.camera_paths import measuring_path, showing_path
 from sparsestyle_ns.evaluation.held_out import saved_report
 from sparsestyle_ns.gallery.collect import collect_run, depth_picture
 from sparsestyle_ns.gallery.film import FRAMES_PER_SECOND, encode_mp4, make_film
@@ -179,7 +180,7 @@ def test_photos_from_all_around_give_one_even_turn_about_what_they_look_at():
     angles = torch.rad2deg(torch.atan2(places[:, 1], places[:, 0]))
     torch.testing.assert_close(torch.diff(angles) % 360, torch.full((11,), 30.0), atol=1e-3, rtol=0)
     torch.testing.assert_close(places.norm(dim=-1), torch.full((12,), 10.0**0.5))
-    assert axes_meet(path.camera_to_worlds).norm() < 1e-4
+    assert meeting_point(path.camera_to_worlds).norm() < 1e-4
 
 
 def test_photos_that_look_one_way_give_a_flight_through_them_there_and_back():

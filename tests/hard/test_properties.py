@@ -14,6 +14,7 @@ import hypothesis.extra.numpy as arrays
 import numpy as np
 import pytest
 import torch
+from conftest import decided
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from nerfstudio.data.scene_box import SceneBox
@@ -29,7 +30,8 @@ from sparsestyle_ns.core import ndc, precision, sampling, schedules
 from sparsestyle_ns.core import occupancy as density_grid
 from sparsestyle_ns.core import spaces as space
 from sparsestyle_ns.core import volrend as compositing
-from sparsestyle_ns.effects.layouts import BoundedBox, Contraction, ForwardFacing
+from sparsestyle_ns.data.scene_info import NDC
+from sparsestyle_ns.effects.layouts import build_space
 from sparsestyle_ns.field_components import (
     hash_grid,
     hash_grid_kernels,
@@ -123,18 +125,13 @@ def unit_rays(draw):
 @st.composite
 def spaces(draw):
     """A space and the scale of its world."""
-    kind = draw(st.sampled_from(["ndc", "box", "contracted"]))
+    kind = draw(st.sampled_from(["ndc", "box", "contraction"]))
     scale = 10 ** draw(st.floats(-4, 4))
     aabb = torch.tensor([[-1.0, -0.7, -0.5], [0.8, 1.0, 0.6]])
     nearest = scale * 10 ** draw(st.floats(0, 1))
-    metadata = {
-        "ndc_focal_over_half_size": [1.5, 2.0],
-        "ndc_near": scale,
-        "ndc_depth_range": [nearest, nearest * 10 ** draw(st.sampled_from([0, 1e-7, 0.5, 4]))],
-    }
-    layout = {"ndc": ForwardFacing, "box": BoundedBox, "contracted": Contraction}[kind]()
+    ndc_map = NDC((1.5, 2.0), scale, (nearest, nearest * 10 ** draw(st.sampled_from([0, 1e-7, 0.5, 4]))))
     box = SceneBox(aabb=aabb if kind == "ndc" else scale * aabb)
-    return layout.build({}, scene_box=box, metadata=metadata), scale
+    return build_space(decided(kind), box, ndc_map), scale
 
 
 def packed_indices(draw, samples):

@@ -58,8 +58,8 @@ def make_untrained(effects=SPARE, seed=0, device="cpu", **settings):
         bake_resolution=48,
         **settings,
     )
-    metadata = {"effects": decided(*effects, background={"color": [1.0, 0.5, 0.0]})}
-    return config.setup(scene_box=BOX, num_train_data=1, metadata=metadata, device=device).eval()
+    decisions = decided(*effects, background={"color": [1.0, 0.5, 0.0]})
+    return config.setup(scene_box=BOX, num_train_data=1, effects=decisions, device=device).eval()
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sparsestyle_ns.data.view_selection import evenly_spaced
+from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.method_configs import method_config
@@ -251,6 +252,8 @@ class Study:
         self.manager: FewShotDataManager = self.coarse_config.pipeline.datamanager.setup(
             device=str(self.device), test_mode="test", world_size=1, local_rank=0
         )
+        self.effects = decide(self.manager.scene, self.coarse_config.pipeline.effects)
+        self.manager.set_effects(self.effects)
         self.eval_dataset = self.manager.eval_dataset
         count = min(HELD_OUT_VIEWS, len(self.eval_dataset))
         self.views = list(evenly_spaced(len(self.eval_dataset), count))
@@ -283,7 +286,7 @@ class Study:
 
     def _adopt_coarse_run(self, folder: Path) -> None:
         run = read_coarse_run(folder)
-        check_scene(run, record_scene(self.manager))
+        check_scene(run, record_scene(self.options.data, self.manager.train_dataparser_outputs, self.effects))
         model = self._setup_pipeline(self._with_model(run.config.pipeline.model)).model
         model.load_state_dict(run.model_state())
         self.keep_coarse(model)
@@ -339,7 +342,7 @@ class Study:
 
     def _setup_pipeline(self, config: TrainerConfig) -> Any:
         config = copy.deepcopy(config)
-        config.pipeline.datamanager = self._shared(config)
+        config.pipeline.datamanager, config.pipeline.decided = self._shared(config), self.effects
         return config.pipeline.setup(device=str(self.device), test_mode="test", world_size=1, local_rank=0)
 
     def start(self, config: TrainerConfig, budget: Budget, seed: int = 0) -> Training:
@@ -354,7 +357,7 @@ class Study:
         if hasattr(config.pipeline.model, "seed"):
             config.pipeline.model.seed += seed
         config.pipeline.datamanager.seed += seed
-        config.pipeline.datamanager = self._shared(config)
+        config.pipeline.datamanager, config.pipeline.decided = self._shared(config), self.effects
         state = None
         if isinstance(config.pipeline, HierStylePipelineConfig):
             state, config.pipeline._target = self.coarse_state, self.shared.pipeline()

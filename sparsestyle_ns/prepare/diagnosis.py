@@ -1,9 +1,9 @@
 """What is wrong with a set of photos, in words: whether they share enough, and whether the camera moved.
 
-Nothing here needs to know the camera. Pairs of photos are compared by SIFT features (Lowe 2004) that agree on a
-fundamental matrix F. Where a homography explains what F explains, the second photo is only a bent first one: the camera
-turned without moving, or saw one flat thing, and no depth can be told. Where F's epipole, the point that the camera
-moves towards, lies in the picture's middle, it moved along its line of sight.
+The camera need not be known. Pairs of photos are compared by matched features that agree on a fundamental matrix F.
+Where a homography explains the same matches, the second photo is only a warped first one: the camera turned without
+moving, or all that it saw is flat, and depth can't be told. Where F's epipole, the point that the camera moves towards,
+lies in the middle of the picture, it moved along its line of sight.
 """
 
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from sparsestyle_ns.data.features import Features, find_features, mutual_matches
 from sparsestyle_ns.utils.progress import track
 
 COMPARED_SIDE = 1000
 """Pixels along the longer side of the pictures that are compared, at most."""
-MAX_FEATURES = 4000
+MAX_FEATURES, MAX_RATIO = 4000, 0.75
+"""Of the matcher (`data.features`)."""
 MIN_FEATURES = 300
 """Features of a photo below which it is blurred, or shows plain surfaces."""
-RATIO = 0.75
-"""A match counts if the next best is this much worse (Lowe's test)."""
 MIN_MATCHES = 30
 """Matches that agree on one geometry, below which two photos count as sharing nothing: a dozen agree by chance."""
 EPIPOLAR_ERROR, FLAT_ERROR = 1.5, 3.0
@@ -32,14 +32,6 @@ FLAT_SHARE = 0.85
 """Share of the matches that a homography explains, from which on a pair has no depth."""
 AXIS_SHARE = 0.2
 """Distance of the epipole from the middle, in longer sides, up to which a move is along the line of sight."""
-
-
-@dataclass
-class Features:
-    """SIFT features of a photo: where they are, in pixels, and what they look like."""
-
-    points: Float[np.ndarray, "features 2"]
-    descriptors: Float[np.ndarray, "features 128"]
 
 
 @dataclass
@@ -73,7 +65,7 @@ class Pair:
 def check_photos(images: Sequence[Image.Image], names: Sequence[str]) -> List[str]:
     """What is wrong with photos of one size, a sentence each; empty where nothing is."""
     small = [shrink(image) for image in images]
-    features = [find_features(image) for image in small]
+    features = [find_features(image, MAX_FEATURES) for image in small]
     pairs = {
         (first, second): compare(features[first], features[second], small[0].shape)
         for first, second in track(list(combinations(range(len(images)), 2)), "Comparing photos")
@@ -88,21 +80,14 @@ def shrink(image: Image.Image) -> np.ndarray:
     return np.asarray(grey)
 
 
-def find_features(grey: np.ndarray) -> Features:
-    """SIFT features of a grey picture."""
-    keypoints, descriptors = cv2.SIFT_create(nfeatures=MAX_FEATURES).detectAndCompute(grey, None)
-    if descriptors is None:
-        return Features(np.empty((0, 2), np.float32), np.empty((0, 128), np.float32))
-    return Features(np.array([keypoint.pt for keypoint in keypoints], np.float32), descriptors)
-
-
 def compare(first: Features, second: Features, shape: Sequence[int]) -> Pair:
     """Matches two photos' features and looks at what geometry they agree on.
 
     Args:
         shape: rows and columns of the pictures.
     """
-    start, end = _match(first, second)
+    here, there = mutual_matches(first.descriptors, second.descriptors, MAX_RATIO)
+    start, end = first.points[here], second.points[there]
     if len(start) < MIN_MATCHES:
         return Pair(len(start), 0, 0.0, None)
     cv2.setRNGSeed(0)  # the same photos get the same verdict
@@ -118,26 +103,12 @@ def compare(first: Features, second: Features, shape: Sequence[int]) -> Pair:
     return Pair(len(start), int(agree.sum()), flat, (point - middle) / max(shape))
 
 
-def _match(first: Features, second: Features) -> List[Float[np.ndarray, "matches 2"]]:
-    """Where features that look alike are in either photo, each used once."""
-    if min(len(first.points), len(second.points)) < 2:
-        return [np.empty((0, 2), np.float32)] * 2
-    found = cv2.BFMatcher().knnMatch(first.descriptors, second.descriptors, k=2)
-    clear = [best for best, other in found if best.distance < RATIO * other.distance]
-    nearest: Dict[int, cv2.DMatch] = {}
-    for match in sorted(clear, key=lambda match: match.distance):
-        nearest.setdefault(match.trainIdx, match)
-    rows = [(match.queryIdx, match.trainIdx) for match in nearest.values()]
-    index = np.array(rows, int).reshape(-1, 2)
-    return [first.points[index[:, 0]], second.points[index[:, 1]]]
-
-
 def _faint(features: Sequence[Features], names: Sequence[str]) -> List[str]:
     return [
-        f"{name} has only {len(found.points)} features that can be found again: it is blurred, dark, or shows plain "
+        f"{name} has only {len(found)} features that can be found again: it is blurred, dark, or shows plain "
         "surfaces; take it again, sharp and with something textured in it."
         for name, found in zip(names, features, strict=True)
-        if len(found.points) < MIN_FEATURES
+        if len(found) < MIN_FEATURES
     ]
 
 

@@ -6,6 +6,7 @@ from typing import List, Sequence, Tuple
 
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
+from sparsestyle_ns.data.photos import images_in
 from sparsestyle_ns.utils.errors import InputError
 
 HEIC_SUFFIXES = (".heic", ".heif")
@@ -73,7 +74,7 @@ def find_photos(folder: Path) -> List[Path]:
     if not folder.is_dir():
         raise InputError(f"There is no folder {folder}; name the folder that the photos are in.")
     for place in (folder, folder / "images"):
-        photos = sorted(_photos_in(place)) if place.is_dir() else []
+        photos = images_in(place, SUFFIXES) if place.is_dir() else []
         if photos:
             break
     if len(photos) < MIN_PHOTOS:
@@ -83,14 +84,6 @@ def find_photos(folder: Path) -> List[Path]:
             "another place."
         )
     return photos
-
-
-def _photos_in(folder: Path) -> List[Path]:
-    return [
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
-    ]
 
 
 def read_photo(path: Path, upright: bool = True) -> Photo:

@@ -12,8 +12,8 @@ from typing import Dict, List, Literal, Optional, Sequence
 
 import torch
 
-from sparsestyle_ns.prepare.checks import check_photos
-from sparsestyle_ns.prepare.photos import (
+from sparsestyle_ns.prepare.diagnosis import check_photos
+from sparsestyle_ns.prepare.framing import (
     MIN_PHOTOS,
     Framing,
     Photo,

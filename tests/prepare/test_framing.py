@@ -7,7 +7,7 @@ import pytest
 from photo_sets import save_with_orientation
 from PIL import Image
 
-from sparsestyle_ns.prepare.photos import Framing, find_photos, frame_photos, read_photo, write_photos
+from sparsestyle_ns.prepare.framing import Framing, find_photos, frame_photos, read_photo, write_photos
 from sparsestyle_ns.utils.errors import InputError
 
 
