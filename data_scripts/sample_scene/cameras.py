@@ -10,11 +10,16 @@ BLENDER_CAMERA_RADIUS = 4.03
 FORWARD_FACING_REACH = 0.25 * 2.1
 """Distance of the outermost columns of cameras from the middle: a quarter of the still life's nearest depth."""
 
-# ---------------------------------------------------------------------------------------------------------- cameras
 
+def look_at(
+    position: Sequence[float], target: Sequence[float], up: Sequence[float] = (0.0, 0.0, 1.0), roll: float = 0.0
+) -> np.ndarray:
+    """A camera at `position` that looks at `target`.
 
-def look_at(position: Sequence[float], target: Sequence[float], roll: float = 0.0) -> np.ndarray:
-    """A camera at `position` that looks at `target`, upright but for `roll` radians about its viewing axis.
+    Args:
+        position, target: In the world.
+        up: Which way is up in the world; the camera stands upright but for
+        roll: an angle in radians about its viewing axis.
 
     Returns:
         Camera-to-world matrix (4, 4), float64; columns right, up, back, position.
@@ -24,29 +29,21 @@ def look_at(position: Sequence[float], target: Sequence[float], roll: float = 0.
     """
     back = np.asarray(position, float) - np.asarray(target, float)
     back /= np.linalg.norm(back)
-    right = np.cross((0.0, 0.0, 1.0), back)
+    right = np.cross(up, back)
     if np.linalg.norm(right) < 1e-6:
         raise ValueError(f"The camera at {tuple(position)} looks straight up or down, so its up is undefined.")
     right /= np.linalg.norm(right)
-    up = np.cross(back, right)
+    upright = np.cross(back, right)
     pose = np.eye(4)
-    pose[:3, 0] = math.cos(roll) * right + math.sin(roll) * up
-    pose[:3, 1] = math.cos(roll) * up - math.sin(roll) * right
+    pose[:3, 0] = math.cos(roll) * right + math.sin(roll) * upright
+    pose[:3, 1] = math.cos(roll) * upright - math.sin(roll) * right
     pose[:3, 2] = back
     pose[:3, 3] = position
     return pose
 
 
 def forward_facing_cameras(count: int, seed: int = 0) -> np.ndarray:
-    """Hand-held photos of `still_life`: a jittered grid of cameras, about 5 columns for every 4 rows, row by row.
-
-    Args:
-        count: How many cameras, at least 1.
-        seed: Which jitter.
-
-    Returns:
-        Camera-to-world matrices (count, 4, 4).
-    """
+    """Hand-held photos of `still_life` -> (count, 4, 4): a jittered grid, about 5 columns for every 4 rows."""
     rng = np.random.default_rng(seed)
     columns = math.ceil(math.sqrt(count * 1.25))
     rows = math.ceil(count / columns)
@@ -82,16 +79,10 @@ def _cameras_on_sphere(azimuths: np.ndarray, elevations: np.ndarray) -> np.ndarr
     return np.reshape(poses, (len(poses), 4, 4))
 
 
-def landscape_cameras(count: int, wander: float = 0.0, seed: int = 0) -> np.ndarray:
-    """Cameras evenly around the plinth in its landscape, on a ring that goes up and down.
+def landscape_cameras(count: int, wander: float, seed: int) -> np.ndarray:
+    """Cameras evenly around the plinth in its landscape, on a ring that goes up and down -> (count, 4, 4).
 
-    Args:
-        count: How many cameras.
-        wander: How far from the objects' middle a camera may look, at most along each axis of the ground.
-        seed: Which directions they look in.
-
-    Returns:
-        Camera-to-world matrices (count, 4, 4).
+    Each looks past the objects' middle, by up to `wander` scene units along either axis of the ground; `seed` says how.
     """
     aside = wander * np.random.default_rng([seed, 2]).uniform(-1, 1, (count, 2))
     poses = []
@@ -102,25 +93,12 @@ def landscape_cameras(count: int, wander: float = 0.0, seed: int = 0) -> np.ndar
     return np.stack(poses)
 
 
-# ------------------------------------------------------------------------------------------------------------- rays
-
-
 def rays_of_rows(
     pose: np.ndarray, focal: float, height: int, width: int, rows: np.ndarray, supersample: int, distortion: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rays through the pixels of some rows of a picture.
+    """Unit directions (3, N) of the rays of some rows of a picture, and their cosines (N,) with the viewing axis.
 
-    Args:
-        pose: Camera-to-world matrix, (3, 4) or (4, 4).
-        focal: In pixels.
-        height, width: Of the picture.
-        rows: Which ones, integers (R,).
-        supersample: Rays along each side of a pixel.
-        distortion: k1 of the lens; see `render_sample`.
-
-    Returns:
-        Unit directions (3, N) in the world and their cosines (N,) with the viewing axis. N runs over rows, then
-        columns, then the samples within a pixel.
+    N runs over `rows`, integers (R,), then columns, then the samples within a pixel. See `render_sample` for the rest.
     """
     offsets = (np.arange(supersample, dtype=np.float32) + 0.5) / supersample
     y = (height / 2 - rows[:, None] - offsets) / focal

@@ -94,7 +94,9 @@ def objects_on_a_plinth(seed: int = 0, shine: float = 0.0, landscape: bool = Fal
     )
     backdrop = far_away() if landscape else ()
     sun = (-0.5, -0.7, 1.2)
-    return Scene(shapes, textures.ValueNoise(seed), sun=sun, sky_light=0.7, sun_light=0.56, backdrop=backdrop, shine=shine)
+    return Scene(
+        shapes, textures.ValueNoise(seed), sun=sun, sky_light=0.7, sun_light=0.56, backdrop=backdrop, shine=shine
+    )
 
 
 def far_away() -> tuple[Shape, ...]:

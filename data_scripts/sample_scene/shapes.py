@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Sequence
 
 import numpy as np
+
 from sample_scene.textures import Texture
 
 Vector = tuple[float, float, float]
@@ -24,43 +25,27 @@ def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 class Shape(ABC):
-    """A solid with a painted surface."""
+    """A solid with a painted surface. What its subclasses work out is relative to the centre."""
 
     centre: Vector
     texture: Texture
-
-    @property
-    @abstractmethod
-    def _reach(self) -> float:
-        """Distance from the centre to the farthest point of the surface."""
+    _reach: float
+    """Distance from the centre to the farthest point of the surface, or a little more."""
 
     @abstractmethod
     def _span(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where lines enter and leave the solid.
-
-        Args:
-            origins: (3, N) or (3, 1), relative to the centre.
-            directions: (3, N), of unit length.
-
-        Returns:
-            Two distances along the lines, (N,) each; the first is larger than the second for a line that misses.
-        """
+        """Distances (N,) at which lines enter and leave it; for a miss the first is larger."""
 
     @abstractmethod
     def _surface(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `surface`, for points (3, N) relative to the centre."""
+        """As `surface`."""
 
     def surface(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What the texture takes, and outward unit normals, at points (3, N) on the surface: (3, N) each."""
         return self._surface(points - column(self.centre))
 
     def distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Distances along rays to the surface: (N,), inf for a miss.
-
-        Args:
-            origins: (3, N), or (3, 1) for rays from one point.
-            directions: (3, N), of unit length.
-        """
+        """Distances along rays, origins (3, N) or (3, 1) and unit directions (3, N), to it: (N,), inf for a miss."""
         origins = origins - column(self.centre)
         along = dot(origins, directions)
         # Only rays that pass through the ball around the shape can hit it.

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+
 from sample_scene.cameras import rays_of_rows
 from sample_scene.scene import Scene
 from sample_scene.shapes import Sphere, column, dot
@@ -15,21 +16,13 @@ SHADOW_RAY_OFFSET = 2e-3
 
 
 def render_sample(
-    camera_to_world: np.ndarray,
-    focal: float,
-    height: int,
-    width: int,
-    scene: Scene,
-    supersample: int = 3,
-    distortion: float = 0.0,
+    pose: np.ndarray, focal: float, height: int, width: int, scene: Scene, supersample: int = 3, distortion: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Renders one view, with its exact depth and coverage.
 
     Args:
-        camera_to_world: (3, 4) or (4, 4); columns right, up, back, position.
-        focal: Focal length in pixels.
-        height: Rows of the picture.
-        width: Columns of the picture.
+        pose: Camera-to-world matrix, (3, 4) or (4, 4); columns right, up, back, position.
+        focal, height, width: Focal length and size of the picture, in pixels.
         scene: What to look at.
         supersample: Rays along each side of a pixel; odd, so that one of them passes through the pixel's centre.
         distortion: k1 of the lens: a point at distance r from the axis, over the focal length, is seen at r + k1 r^3.
@@ -45,7 +38,7 @@ def render_sample(
     """
     if supersample < 1 or supersample % 2 == 0:
         raise ValueError(f"supersample is {supersample}, but has to be odd, so that a ray passes the pixel's centre.")
-    pose = np.asarray(camera_to_world, np.float32)
+    pose = np.asarray(pose, np.float32)
     samples = supersample**2
     rgb = np.zeros((height, width, 3), np.float32)
     alpha = np.zeros((height, width), np.float32)
@@ -65,16 +58,9 @@ def render_sample(
 
 
 def trace(scene: Scene, origin: np.ndarray, directions: np.ndarray, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """What rays from one point see.
+    """Colours (3, N), 0 where a ray hits nothing, and distances (N,), inf there, of rays from one origin (3, 1).
 
-    Args:
-        scene: What to look at.
-        origin: (3, 1).
-        directions: (3, N), of unit length; the rays of a pixel follow one another.
-        samples: Rays of a pixel.
-
-    Returns:
-        Colours (3, N), 0 where a ray hits nothing, and distances (N,), inf there.
+    The `directions` (3, N) have unit length; each `samples` of them that follow one another belong to a pixel.
     """
     shapes = scene.shapes + scene.backdrop
     nearest = np.full(directions.shape[1], np.inf, np.float32)
@@ -110,18 +96,10 @@ def trace(scene: Scene, origin: np.ndarray, directions: np.ndarray, samples: int
 def diffuse_light(
     scene: Scene, points: np.ndarray, normals: np.ndarray, sample: np.ndarray, samples: int
 ) -> np.ndarray:
-    """Light of sky and sun that reaches surface points.
+    """Light (3, N) of a soft sky and a sun at surface points (3, N): factors of the surface's colour.
 
-    Each sample of a pixel looks at another spot of the sun's disc; the pixel's mean is its share of the disc.
-
-    Args:
-        scene: What stands in the light's way.
-        points, normals: (3, N).
-        sample: Number of each point's ray within its pixel, (N,), below `samples`.
-        samples: Rays of a pixel.
-
-    Returns:
-        (3, N), by which the surface's colour is multiplied.
+    Each of a pixel's `samples` rays, of which a point belongs to number `sample` (N,), looks at another spot of the
+    sun's disc; the pixel's mean is the share of the disc that it sees, so shadows have penumbras.
     """
     to_sun = _spots_on_sun(scene, samples)[:, sample]
     facing = np.maximum(dot(normals, to_sun), 0)

@@ -4,7 +4,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Callable, Iterator, Literal, Optional, Sequence
+from typing import Annotated, Iterator, Literal, Optional, Sequence
 
 import imageio.v2 as imageio
 import numpy as np
@@ -12,16 +12,17 @@ import tyro
 from _command_line import check_ranges
 from rich.console import Console
 from rich.progress import track
+
 from sample_scene.cameras import circling_cameras, forward_facing_cameras, landscape_cameras, surrounding_cameras
-from sample_scene.scene import objects_on_a_plinth, still_life
+from sample_scene.scene import Scene, objects_on_a_plinth, still_life
 from sample_scene.tracer import render_sample
 
 FOCAL_PER_WIDTH = 0.85
 BLENDER_CAMERA_ANGLE_X = 0.6911112
 
 
-def _flag(default: str) -> object:
-    """A number that is left out by default, with what the help says then."""
+def _number(default: str) -> object:
+    """An optional number, whose default the help describes in words."""
     return tyro.conf.arg(metavar="INT", help_behavior_hint=f"(default: {default})")
 
 
@@ -35,9 +36,9 @@ class Settings:
     """Which to write; both: llff and blender."""
     num_views: int = 20
     """llff and nerfstudio: number of pictures."""
-    width: Annotated[Optional[int], _flag("252, blender 100")] = None
+    width: Annotated[Optional[int], _number("252, blender 100")] = None
     """Columns of the pictures."""
-    height: Annotated[Optional[int], _flag("3/4 of the columns")] = None
+    height: Annotated[Optional[int], _number("3/4 of the columns")] = None
     """llff and nerfstudio: rows of the pictures; blender's are square."""
     num_train: int = 100
     """blender: number of training pictures."""
@@ -75,17 +76,14 @@ class Settings:
 
 
 def write_llff(folder: Path, settings: Settings) -> None:
-    """Writes `images/image000.png`, ... and `poses_bounds.npy` of `still_life` into an existing folder."""
-    count, (width, height, focal) = settings.num_views, _photo_size(settings)
+    """Writes `images/image000.png`, ... and `poses_bounds.npy` of `still_life`."""
     scene = still_life(settings.seed, settings.shiny, settings.haze)
-    gains = photo_gains(count, settings.exposure, held_out_views(count), settings.seed)
-    (folder / "images").mkdir()
-    rows = []
-    for i, pose in _each(forward_facing_cameras(count, settings.seed), "llff"):
-        rgb, _, depth = render_sample(pose, focal, height, width, scene, settings.supersample)
-        imageio.imwrite(folder / "images" / f"image{i:03d}.png", to_bytes(rgb * gains[i]))
-        seen = depth[np.isfinite(depth)]
-        rows.append(poses_bounds_row(pose, height, width, focal, 0.9 * seen.min(), seen.max()))
+    poses = forward_facing_cameras(settings.num_views, settings.seed)
+    depths = [depth[np.isfinite(depth)] for depth in _write_photos(folder, poses, scene, settings)]
+    rows = [
+        poses_bounds_row(pose, *_photo_size(settings), near=0.9 * depth.min(), far=depth.max())
+        for pose, depth in zip(poses, depths, strict=True)
+    ]
     np.save(folder / "poses_bounds.npy", np.stack(rows))
 
 
@@ -120,51 +118,41 @@ def write_blender(folder: Path, settings: Settings) -> None:
 
 
 def write_nerfstudio(folder: Path, settings: Settings) -> None:
-    """Writes `images` and `transforms.json` of `objects_on_a_plinth` in a landscape into an existing folder.
+    """Writes `images` and `transforms.json` of `objects_on_a_plinth` in a landscape.
 
     The file says which views are held out, for validation and test alike.
     """
-    count, (width, height, focal) = settings.num_views, _photo_size(settings)
     scene = objects_on_a_plinth(settings.seed, settings.shiny, landscape=True)
-    names = [f"images/image{i:03d}.png" for i in range(count)]
-    held_out = held_out_views(count)
-    gains = photo_gains(count, settings.exposure, held_out, settings.seed)
-    (folder / "images").mkdir()
-    frames = []
-    for i, pose in _each(landscape_cameras(count, settings.wander, settings.seed), "nerfstudio"):
-        rgb, _, _ = render_sample(pose, focal, height, width, scene, settings.supersample, settings.distortion)
-        imageio.imwrite(folder / names[i], to_bytes(rgb * gains[i]))
-        frames.append({"file_path": names[i], "transform_matrix": pose.tolist()})
+    poses = landscape_cameras(settings.num_views, settings.wander, settings.seed)
+    _write_photos(folder, poses, scene, settings)
+    height, width, focal = _photo_size(settings)
     camera = {"camera_model": "OPENCV", "fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2}
     lens = {"k1": settings.distortion, "k2": 0.0, "p1": 0.0, "p2": 0.0} if settings.distortion else {}
-    test = [names[i] for i in held_out] or names
-    splits = {"train_filenames": [name for i, name in enumerate(names) if i not in held_out]}
-    splits |= {"val_filenames": test, "test_filenames": test}
+    names = [_photo_name(i) for i in range(len(poses))]
+    held_out = [names[i] for i in held_out_views(len(poses))]
+    splits = {"train_filenames": [name for name in names if name not in held_out]}
+    splits |= {"val_filenames": held_out or names, "test_filenames": held_out or names}
+    frames = [{"file_path": name, "transform_matrix": pose.tolist()} for name, pose in zip(names, poses, strict=True)]
     content = {**camera, "w": width, "h": height, **lens, **splits, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(content, indent=2))
 
 
-WRITERS: dict[str, Callable[[Path, Settings], None]] = {
-    "llff": write_llff,
-    "blender": write_blender,
-    "nerfstudio": write_nerfstudio,
-}
+WRITERS = {"llff": write_llff, "blender": write_blender, "nerfstudio": write_nerfstudio}
+"""What writes each layout into an existing folder."""
 
 
-def poses_bounds_row(
-    camera_to_world: np.ndarray, height: int, width: int, focal: float, near: float, far: float
-) -> np.ndarray:
+def poses_bounds_row(pose: np.ndarray, height: int, width: int, focal: float, near: float, far: float) -> np.ndarray:
     """One row of `poses_bounds.npy`.
 
     Args:
-        camera_to_world: (3, 4) or (4, 4); columns right, up, back, position.
+        pose: Camera-to-world matrix, (3, 4) or (4, 4); columns right, up, back, position.
         height, width, focal: In pixels of the stored picture.
         near, far: Depths in scene units.
 
     Returns:
         (17,): the 3 x 5 matrix with columns down, right, back, position, (height, width, focal), row by row; near; far.
     """
-    right, up, back, position = np.asarray(camera_to_world)[:3].T
+    right, up, back, position = np.asarray(pose)[:3].T
     matrix = np.stack([-up, right, back, position, (height, width, focal)], axis=1)
     return np.concatenate([matrix.ravel(), (near, far)])
 
@@ -197,10 +185,27 @@ def to_bytes(image: np.ndarray) -> np.ndarray:
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
+def _photo_name(view: int) -> str:
+    return f"images/image{view:03d}.png"
+
+
 def _photo_size(settings: Settings) -> tuple[int, int, float]:
-    """Width, height and focal length in pixels, of the layouts whose pictures are photos."""
+    """Height, width and focal length in pixels, of llff's and nerfstudio's photos."""
     width = settings.width or 252
-    return width, settings.height or round(0.75 * width), FOCAL_PER_WIDTH * width
+    return settings.height or round(0.75 * width), width, FOCAL_PER_WIDTH * width
+
+
+def _write_photos(folder: Path, poses: np.ndarray, scene: Scene, settings: Settings) -> list[np.ndarray]:
+    """Writes photos of a scene from camera-to-world matrices (N, 4, 4); returns their depths, (height, width) each."""
+    height, width, focal = _photo_size(settings)
+    gains = photo_gains(len(poses), settings.exposure, held_out_views(len(poses)), settings.seed)
+    (folder / "images").mkdir()
+    depths = []
+    for i, pose in _each(poses, "photos"):
+        rgb, _, depth = render_sample(pose, focal, height, width, scene, settings.supersample, settings.distortion)
+        imageio.imwrite(folder / _photo_name(i), to_bytes(rgb * gains[i]))
+        depths.append(depth)
+    return depths
 
 
 def _each(poses: np.ndarray, what: str) -> Iterator[tuple[int, np.ndarray]]:
