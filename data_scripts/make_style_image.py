@@ -5,27 +5,23 @@ furrowed fields and a dark tree. The same size, seed and palette give the same p
 
     python data_scripts/make_style_image.py OUTPUT.png
     python data_scripts/make_style_image.py OUTPUT.png --size 768 --palette harvest --seed 3
-
-The picture is painted in layers, each with finer strokes than the last. A stroke is a short curve along the flow, and
-consists of bristles: thin parallel lines of slightly different tone that also leave a relief of paint. Light from the
-upper left on that relief is what makes the strokes stand out.
 """
 
-import argparse
 import math
-import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Optional, Sequence
+from typing import Annotated, Optional, Sequence
 
 import cv2
 import numpy as np
+import tyro
+from _command_line import ScriptError, check_ranges, exit_status, parse, print_made
 
 SUBPIXEL_BITS = 4
 """OpenCV draws lines with end points in units of 1 / 2^SUBPIXEL_BITS pixel."""
 THICKEST_PAINT = 150
-"""What the relief, a picture of bytes since OpenCV smooths no other lines, calls a thickness of 1."""
+"""A thickness of 1 in the relief, which holds bytes because OpenCV draws smooth lines into nothing else."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +102,10 @@ LAYERS = (
 
 
 def paint(size: int = 512, seed: int = 0, palette: str = "night") -> np.ndarray:
-    """Paints the picture.
+    """Paints the picture, in layers of ever finer strokes.
+
+    A stroke is a short curve along the flow, and consists of bristles: thin parallel lines of slightly different tone
+    that also leave a relief of paint. Light from the upper left on that relief makes the strokes stand out.
 
     Args:
         size: Rows; there are 5 columns for every 4 rows.
@@ -126,7 +125,7 @@ def paint(size: int = 512, seed: int = 0, palette: str = "night") -> np.ndarray:
     rng = np.random.default_rng(seed)
     height, width = size, round(1.25 * size)
     colours, flow = compose(height, width, rng, PALETTES[palette])
-    canvas = np.full((height, width, 3), _rgb(PALETTES[palette].ground), np.uint8)
+    canvas = np.full((height, width, 3), _paints([PALETTES[palette].ground])[0], np.uint8)
     relief = np.zeros((height, width), np.uint8)
     for layer in LAYERS:
         _paint_layer(canvas, relief, colours, flow, layer, rng)
@@ -337,42 +336,58 @@ def _light_on_relief(relief: np.ndarray, size: int) -> np.ndarray:
     return 1 + 0.30 * np.tanh(slope * 0.9)
 
 
-def _rgb(hex_code: str) -> np.ndarray:
-    """'#rrggbb' -> (3,) float32 in [0, 255]."""
-    return np.array([int(hex_code[i : i + 2], 16) for i in (1, 3, 5)], np.float32)
-
-
 def _paints(hex_codes: Sequence[str]) -> np.ndarray:
     """K codes '#rrggbb' -> (K, 3) float32 in [0, 255]."""
-    return np.stack([_rgb(code) for code in hex_codes])
+    return np.array([list(bytes.fromhex(code[1:])) for code in hex_codes], np.float32)
 
 
 # ---------------------------------------------------------------------------------------------------- command line
 
 
-def main(arguments: Optional[Sequence[str]] = None) -> int:
-    """The command line; `arguments` default to the process's own. Returns the exit status."""
-    parser = argparse.ArgumentParser(description="Paints a style image in thick strokes.")
-    parser.add_argument("output", type=Path, help="picture to write, .png or .jpg")
-    parser.add_argument("--size", type=int, default=512, help="rows of the picture, at least 64")
-    parser.add_argument("--seed", type=int, default=0, help="which arrangement")
-    parser.add_argument("--palette", choices=tuple(PALETTES), default="night", help="which paints")
-    options = parser.parse_args(arguments)
-    if options.seed < 0:
-        parser.error(f"--seed is {options.seed}, but has to be at least 0")
-    if options.output.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        parser.error(f"OUTPUT is {options.output}, but has to end in .png or .jpg")
+@dataclass(frozen=True)
+class Options:
+    """The command line; the docstrings are its help."""
+
+    output: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUTPUT")]
+    """Picture to write, .png or .jpg."""
+    size: int = 512
+    """Rows of the picture, at least 64; there are 5 columns for every 4 rows."""
+    seed: int = 0
+    """Which arrangement of whirls, hills and strokes."""
+    palette: tyro.extras.literal_type_from_choices(PALETTES) = "night"
+    """Which paints."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, seed=(0, math.inf))
+        if self.output.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+            raise ValueError(f"OUTPUT is {self.output}, but has to end in .png or .jpg")
+
+
+def write_picture(options: Options) -> None:
+    """Paints a picture and writes it.
+
+    Raises:
+        ScriptError: It is too small to be painted, or cannot be written.
+    """
     try:
         picture = paint(options.size, options.seed, options.palette)
         options.output.parent.mkdir(parents=True, exist_ok=True)
         _, encoded = cv2.imencode(options.output.suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         options.output.write_bytes(encoded.tobytes())
-    except (OSError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
-    command = ["ns-train", "hier-style", "--style-image", str(options.output), "--data", "SCENE", "llff-data"]
-    print(f"Made {options.output} – next: {shlex.join(command)}")
-    return 0
+    except ValueError as error:
+        raise ScriptError(str(error)) from error
+    except OSError as error:
+        raise ScriptError(
+            f"Cannot write {options.output}: {error.strerror or error}; choose another OUTPUT."
+        ) from error
+    command = ["ns-train", "hier-style", "--style-image", options.output, "--data", "SCENE", "llff-data"]
+    print_made(options.output, command)
+
+
+def main(arguments: Optional[Sequence[str]] = None) -> int:
+    """The command line; `arguments` default to the process's own. Returns the exit status."""
+    options = parse(Options, __doc__, arguments)
+    return exit_status(lambda: write_picture(options))
 
 
 if __name__ == "__main__":
