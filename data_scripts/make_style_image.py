@@ -26,7 +26,7 @@ THICKEST_PAINT = 150
 
 @dataclass(frozen=True)
 class Palette:
-    """The tubes of paint: '#rrggbb' codes for every part of the picture."""
+    """Paints for every part of the picture, as '#rrggbb'."""
 
     sky: tuple[str, ...]
     """From the horizon up."""
@@ -37,7 +37,7 @@ class Palette:
     field: tuple[str, ...]
     """The furrows, in turn."""
     tree: tuple[str, ...]
-    """Its tongues, in turn."""
+    """Its flames, in turn."""
     ground: str
     """The canvas's first coat, which shows between strokes."""
 
@@ -91,7 +91,7 @@ class Layer:
     bristles: int
     """Lines in a stroke."""
     contrast: float
-    """How far tones stray from the tube's colour, in [0, 1]."""
+    """How far tones stray from the paint's colour, in [0, 1]."""
 
 
 LAYERS = (
@@ -148,13 +148,14 @@ def compose(height: int, width: int, rng: np.random.Generator, palette: Palette)
         Colours (height, width, 3) float32 in [0, 255], and unit vectors (height, width, 2), x first, y down.
     """
     y, x = np.mgrid[0:height, 0:width].astype(np.float32) / height
-    sun = np.array([rng.uniform(0.85, 1.05), rng.uniform(0.17, 0.25)])
+    sun = (rng.uniform(0.85, 1.05), rng.uniform(0.17, 0.25))
     whirls = [
         (rng.uniform(0.42, 0.58), rng.uniform(0.28, 0.36), 0.17, 1.0),
         (rng.uniform(0.72, 0.84), rng.uniform(0.46, 0.52), 0.10, -1.0),
         (rng.uniform(0.12, 0.22), rng.uniform(0.12, 0.2), 0.12, -1.0),
     ]
-    colours, flow = _sky(x, y, sun, whirls, palette, rng)
+    colours, flow = _sky(x, y, whirls, palette, rng)
+    _add_sun(colours, flow, x, y, sun, palette)
     _add_land(colours, flow, x, y, palette, rng)
     _add_tree(colours, flow, x, y, rng.uniform(0.16, 0.24), palette)
     flow /= np.maximum(np.linalg.norm(flow, axis=-1, keepdims=True), 1e-6)
@@ -162,14 +163,9 @@ def compose(height: int, width: int, rng: np.random.Generator, palette: Palette)
 
 
 def _sky(
-    x: np.ndarray,
-    y: np.ndarray,
-    sun: np.ndarray,
-    whirls: Sequence[tuple[float, float, float, float]],
-    palette: Palette,
-    rng: np.random.Generator,
+    x: np.ndarray, y: np.ndarray, whirls: Sequence[tuple[float, ...]], palette: Palette, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bands of sky dragged around whirls (x, y, radius, sense), and a sun with halos: colours and flow."""
+    """Colours and flow of a banded sky, dragged around whirls (x, y, radius, 1 clockwise or -1 against it)."""
     phase = rng.uniform(0, 2 * math.pi, 2)
     flow = np.stack([np.ones_like(x), 0.45 * np.cos(5 * x + phase[0]) + 0.2 * np.sin(9 * y + phase[1])], axis=-1)
     tone = (0.62 - y) / 0.62 + 0.12 * np.sin(4.2 * x + phase[0]) + 0.07 * np.sin(13 * y + 3 * x)
@@ -177,21 +173,31 @@ def _sky(
         dx, dy = x - centre_x, y - centre_y
         distance = np.hypot(dx, dy)
         pull = np.exp(-((distance / radius) ** 2))
-        around = np.stack([-dy, dx], axis=-1) * sense / np.maximum(distance, 1e-4)[..., None]
-        flow = flow * (1 - pull[..., None]) + 2.2 * pull[..., None] * around
+        _turn_flow(flow, dx, dy, pull, 2.2, sense)
         spiral = np.sin(np.arctan2(dy, dx) * 2 * sense + distance / radius * 8)
         tone = tone * (1 - 0.55 * pull) + pull * (0.15 + 0.45 * spiral)
     steps = np.clip(tone * len(palette.sky), 0, len(palette.sky) - 1).astype(int)
-    colours = _paints(palette.sky)[steps]
+    return _paints(palette.sky)[steps], flow
 
+
+def _add_sun(
+    colours: np.ndarray, flow: np.ndarray, x: np.ndarray, y: np.ndarray, sun: tuple[float, float], palette: Palette
+) -> None:
+    """A sun with halos, which the flow goes around; in place."""
     dx, dy = x - sun[0], y - sun[1]
     distance = np.hypot(dx, dy)
-    rings = _paints(palette.light)[np.clip(distance / 0.045, 0, len(palette.light) - 1).astype(int)]
+    rings = np.clip(distance / 0.045, 0, len(palette.light) - 1).astype(int)
     is_halo = (distance < 0.14) | ((distance < 0.27) & (np.sin(distance * 90) > 0.1))
-    colours = np.where(is_halo[..., None], rings, colours)
-    pull = np.clip(1.6 - distance / 0.19, 0, 1)[..., None]
-    around = np.stack([-dy, dx], axis=-1) / np.maximum(distance, 1e-4)[..., None]
-    return colours, flow * (1 - pull) + 2.0 * pull * around
+    colours[is_halo] = _paints(palette.light)[rings[is_halo]]
+    _turn_flow(flow, dx, dy, np.clip(1.6 - distance / 0.19, 0, 1), 2.0)
+
+
+def _turn_flow(
+    flow: np.ndarray, dx: np.ndarray, dy: np.ndarray, pull: np.ndarray, speed: float, sense: float = 1.0
+) -> None:
+    """Bends the flow around the point from which pixels are (dx, dy) away, by a share `pull` in [0, 1]; in place."""
+    around = np.stack([-dy, dx], axis=-1) * sense / np.maximum(np.hypot(dx, dy), 1e-4)[..., None]
+    flow[:] = flow * (1 - pull[..., None]) + speed * pull[..., None] * around
 
 
 def _add_land(
@@ -222,7 +228,7 @@ def _add_land(
 def _add_tree(
     colours: np.ndarray, flow: np.ndarray, x: np.ndarray, y: np.ndarray, root: float, palette: Palette
 ) -> None:
-    """A tree like a flame, from the lower edge up into the sky; in place."""
+    """A flame-shaped tree, from the lower edge up into the sky; in place."""
     up = np.clip((1.02 - y) / 0.92, 0, 1)
     lean = root + 0.03 * np.sin(6.5 * up) * up
     half_width = 0.15 * np.sqrt(np.clip(1 - up, 0, 1)) * (0.75 + 0.35 * np.sin(4.5 * up + 0.6))
