@@ -1,5 +1,7 @@
-"""The flight of the demo's camera, as nerfstudio reads camera paths. Poses are camera-to-world matrices with columns
-right, up, back, position."""
+"""The flight of the demo's camera, as nerfstudio reads camera paths.
+
+Poses are camera-to-world matrices; columns right, up, back, position.
+"""
 
 import json
 import math

@@ -14,15 +14,9 @@ FORWARD_FACING_REACH = 0.25 * 2.1
 def look_at(
     position: Sequence[float], target: Sequence[float], up: Sequence[float] = (0.0, 0.0, 1.0), roll: float = 0.0
 ) -> np.ndarray:
-    """A camera at `position` that looks at `target`.
+    """A camera at `position` that looks at `target`, upright but for `roll` radians about its viewing axis.
 
-    Args:
-        position, target: In the world.
-        up: Which way is up in the world; the camera stands upright but for
-        roll: an angle in radians about its viewing axis.
-
-    Returns:
-        Camera-to-world matrix (4, 4), float64; columns right, up, back, position.
+    `up` is the world's. Returns the camera-to-world matrix (4, 4), float64; columns right, up, back, position.
 
     Raises:
         ValueError: If the camera would look straight up or down, where upright means nothing.
