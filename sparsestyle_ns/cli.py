@@ -89,7 +89,7 @@ def evaluate(
         baked: Also measure how close a stylised run's baked renders are to exact ones (PSNR in dB).
     """
     from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config
-    from sparsestyle_ns.utils.output_file import prepare_output
+    from sparsestyle_ns.utils.files import prepare_output
 
     needs_style = baked or style_image is not None
     config = find_config(run, STYLE_METHOD if needs_style else "")
@@ -342,7 +342,7 @@ def export(
             with WebGL2 promises.
     """
     from sparsestyle_ns.runs.run_folder import STYLE_METHOD, find_config
-    from sparsestyle_ns.utils.output_file import prepare_output
+    from sparsestyle_ns.utils.files import prepare_output
 
     if not 32 <= resolution <= 1023:
         raise InputError(f"--resolution {resolution} isn't between 32 and 1023; 255 suits most scenes.")

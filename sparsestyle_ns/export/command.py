@@ -30,7 +30,7 @@ from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.models.hier_style import RAYS_PER_CALL, HierStyleModel
 from sparsestyle_ns.runs.run_folder import load_run
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.output_file import write_output
+from sparsestyle_ns.utils.files import write_output
 from sparsestyle_ns.utils.progress import track
 
 COMPARED_SIDE = 252

@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
-from sparsestyle_ns.utils.output_file import prepare_output, write_output
+from sparsestyle_ns.utils.files import prepare_output, write_output
 
 Pixels = UInt8[np.ndarray, "H W 3"]
 
