@@ -1,7 +1,7 @@
 """Cameras of the page: the training views as pinholes, and how far one may turn away from the one it opens with.
 
 A turned camera is the opening one, first pitched about its own right axis and then yawed about the scene's up axis,
-both through a target on its line of sight. The page does the same (`turnedPose` in page.js).
+both through a target on its line of sight. The page does the same (`turnedPose` in web_page.js).
 """
 
 import math
@@ -48,16 +48,8 @@ class Orbit:
 
 def pinholes(cameras: Cameras) -> Cameras:
     """The same cameras without distortion, which a page doesn't draw."""
-    return Cameras(
-        camera_to_worlds=cameras.camera_to_worlds,
-        fx=cameras.fx,
-        fy=cameras.fy,
-        cx=cameras.cx,
-        cy=cameras.cy,
-        width=cameras.width,
-        height=cameras.height,
-        camera_type=CameraType.PERSPECTIVE,
-    )
+    names = ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height")
+    return Cameras(**{name: getattr(cameras, name) for name in names}, camera_type=CameraType.PERSPECTIVE)
 
 
 def resized(camera: Cameras, longest: int) -> Cameras:
@@ -114,11 +106,10 @@ def turned(orbit: Orbit, cameras: Cameras, yaw: float, pitch: float) -> Cameras:
 
 
 def rotation(axis: Float[Tensor, "3"], degrees: float) -> Float[Tensor, "3 3"]:
-    """Rotation about a unit vector by the right-hand rule (Rodrigues)."""
+    """Rotation about a unit vector by the right-hand rule."""
     x, y, z = axis.tolist()
     cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    angle = math.radians(degrees)
-    return torch.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+    return torch.matrix_exp(math.radians(degrees) * cross)
 
 
 def survey(orbit: Orbit, cameras: Cameras) -> List[Cameras]:

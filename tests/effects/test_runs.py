@@ -13,7 +13,7 @@ import sparsestyle_ns.pipelines.datamanager as datamanager
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.exposure import ExposureCorrection
 from sparsestyle_ns.effects.registry import EFFECTS
-from sparsestyle_ns.gallery.page import RunPictures, gallery_page
+from sparsestyle_ns.gallery.layout import RunPictures, gallery_page
 from sparsestyle_ns.runs.coarse_run import newest_checkpoint
 from sparsestyle_ns.runs.run_folder import find_config, load_run
 from sparsestyle_ns.viewer.effects_panel import EffectsPanel
@@ -128,7 +128,7 @@ def test_the_page_has_a_line_for_every_effect() -> None:
 def view():
     import numpy as np
 
-    from sparsestyle_ns.gallery.page import View
+    from sparsestyle_ns.gallery.layout import View
 
     picture = np.zeros((4, 4, 3), np.uint8)
     return View("view", picture, picture)

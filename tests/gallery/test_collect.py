@@ -15,8 +15,8 @@ from PIL import Image
 from sparsestyle_ns.core.camera_paths import axes_meet, measuring_path, showing_path
 from sparsestyle_ns.evaluation.held_out import saved_report
 from sparsestyle_ns.gallery.collect import collect_run, depth_picture
-from sparsestyle_ns.gallery.film import FRAMES_PER_SECOND, encode_mp4, make_film
-from sparsestyle_ns.gallery.page import gallery_page, read_film
+from sparsestyle_ns.gallery.film import FRAMES_PER_SECOND, encode_mp4, make_film, read_film
+from sparsestyle_ns.gallery.layout import gallery_page
 from sparsestyle_ns.runs.coarse_run import newest_checkpoint
 from sparsestyle_ns.utils.errors import InputError
 
@@ -143,7 +143,7 @@ def test_a_run_whose_folder_takes_no_report_is_measured_and_shown_all_the_same(r
     (moved / "evaluation.json").mkdir()
     shown = collect_run(moved, num_views=1, frames=0, evaluate=True)
     assert [table.title.split(",")[0] for table in shown.tables][:2] == ["Coarse field", "Style and content"]
-    assert f"evaluation.json can't be left in {moved} (Is a directory); its figures are" in capsys.readouterr().out
+    assert f"evaluation.json can't be saved in {moved} (Is a directory); its figures are" in capsys.readouterr().out
 
 
 def frames_of(content):

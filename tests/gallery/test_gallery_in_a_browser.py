@@ -7,7 +7,7 @@ from test_gallery_page import make_pixels, make_run
 
 from sparsestyle_ns.evaluation.tables import Table
 from sparsestyle_ns.gallery.film import encode_mp4
-from sparsestyle_ns.gallery.page import Film, View, gallery_page
+from sparsestyle_ns.gallery.layout import Film, View, gallery_page
 
 pytestmark = needs_chromium
 RED, BLUE = (200, 30, 20), (20, 40, 190)
