@@ -6,7 +6,7 @@ both through a target on its line of sight. The page does the same (`turnedPose`
 
 import math
 from dataclasses import dataclass
-from typing import Iterator, List, Tuple
+from typing import List, Optional, Tuple
 
 import torch
 from jaxtyping import Float
@@ -46,19 +46,18 @@ class Orbit:
     distance: Tuple[float, float]
 
 
-def pinholes(cameras: Cameras) -> Cameras:
-    """The same cameras without distortion, which a page doesn't draw."""
+def pinholes(cameras: Cameras, longest: Optional[int] = None) -> Cameras:
+    """The same cameras without distortion, which a page doesn't draw.
+
+    Args:
+        longest: pixels along the longer side, at most; None for all that they have.
+    """
     names = ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height")
-    return Cameras(**{name: getattr(cameras, name) for name in names}, camera_type=CameraType.PERSPECTIVE)
-
-
-def resized(camera: Cameras, longest: int) -> Cameras:
-    """One camera with at most `longest` pixels along its longer side."""
-    smaller = pinholes(camera)
-    scale = longest / int(max(camera.width.max(), camera.height.max()))
-    if scale < 1.0:
-        smaller.rescale_output_resolution(scale)
-    return smaller
+    plain = Cameras(**{name: getattr(cameras, name) for name in names}, camera_type=CameraType.PERSPECTIVE)
+    side = int(max(cameras.width.max(), cameras.height.max()))
+    if longest is not None and longest < side:
+        plain.rescale_output_resolution(longest / side)
+    return plain
 
 
 def most_central(cameras: Cameras) -> int:
@@ -113,15 +112,12 @@ def rotation(axis: Float[Tensor, "3"], degrees: float) -> Float[Tensor, "3 3"]:
 
 
 def survey(orbit: Orbit, cameras: Cameras) -> List[Cameras]:
-    """Small cameras that between them see what the page may show: the training views, and turns of the opening one."""
+    """Small cameras that between them see what the page may show: the training views, and turns of the opening one.
+
+    The turns are at most 30 degrees apart, and at least three each way.
+    """
     views = [cameras[index : index + 1] for index in range(len(cameras))]
-    views += [turned(orbit, cameras, yaw, pitch) for yaw, pitch in _directions(orbit)]
-    return [resized(view, SURVEY_SIDE) for view in views]
-
-
-def _directions(orbit: Orbit) -> Iterator[Tuple[float, float]]:
-    """(yaw, pitch) at most 30 degrees apart, and at least three of each."""
-    counts = [max(3, math.ceil((high - low) / 30.0) + 1) for low, high in (orbit.yaw, orbit.pitch)]
-    for yaw in torch.linspace(*orbit.yaw, counts[0]).tolist():
-        for pitch in torch.linspace(*orbit.pitch, counts[1]).tolist():
-            yield yaw, pitch
+    ranges = orbit.yaw, orbit.pitch
+    angles = [torch.linspace(low, high, max(3, math.ceil((high - low) / 30.0) + 1)) for low, high in ranges]
+    views += [turned(orbit, cameras, yaw, pitch) for yaw, pitch in torch.cartesian_prod(*angles).tolist()]
+    return [pinholes(view, SURVEY_SIDE) for view in views]

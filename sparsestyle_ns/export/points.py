@@ -1,6 +1,5 @@
 """Coloured points on the surfaces that a scene's training views see, and how well they stand for the scene."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
@@ -24,8 +23,7 @@ MAX_DEPTH = 10.0
 """What is farther away than this many times the median depth is background, not shape."""
 
 
-@dataclass
-class Points:
+class Points(NamedTuple):
     """Surface points in the coordinates of nerfstudio's cameras.
 
     Attributes:
@@ -62,7 +60,9 @@ def surfaces(scene: StylisedScene) -> Tuple[List[Dict[str, Tensor]], List[Points
     """Full renders of the training views, with the colours of surfaces alone, and the points that each sees."""
     background = scene.model.background
     background = None if background is None else background.cpu()
-    pictures = [without_background(picture, background) for picture in exact_pictures(scene)]
+    pictures = exact_pictures(scene)
+    for picture in pictures:
+        picture["rgb"] = straight_color(picture["rgb"], picture["accumulation"], background)
     return pictures, [surface_points(scene.cameras[i : i + 1], picture) for i, picture in enumerate(pictures)]
 
 
@@ -85,11 +85,6 @@ def surface_points(camera: Cameras, picture: Dict[str, Tensor]) -> Points:
     return Points(origins + depth[solid] * bundle.directions[solid], picture["rgb"][solid], origins)
 
 
-def without_background(picture: Dict[str, Tensor], background: Optional[Float[Tensor, "3"]]) -> Dict[str, Tensor]:
-    """A render with the colours of its surfaces alone, where pixels also show some background between them."""
-    return {**picture, "rgb": straight_color(picture["rgb"], picture["accumulation"], background)}
-
-
 def at_edge(depth: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
     """Pixels whose depth differs from that of one of the four neighbours by more than `MAX_JUMP`."""
     padded = F.pad(depth[None], (1, 1, 1, 1), mode="replicate")[0]
@@ -99,7 +94,7 @@ def at_edge(depth: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
 
 def joined(parts: Sequence[Points]) -> Points:
     """All points of several clouds."""
-    return Points(*(torch.cat([getattr(part, name) for part in parts]) for name in ("positions", "colors", "origins")))
+    return Points(*map(torch.cat, zip(*parts, strict=True)))
 
 
 def encode_ply(points: Points) -> bytes:

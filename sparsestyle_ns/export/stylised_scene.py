@@ -8,7 +8,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sparsestyle_ns.evaluation.held_out import exact_outputs
-from sparsestyle_ns.export.orbit import pinholes, resized
+from sparsestyle_ns.export.orbit import pinholes
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.runs.run_folder import load_run
 from sparsestyle_ns.utils.progress import track
@@ -53,7 +53,6 @@ def exact_pictures(scene: StylisedScene, longest: Optional[int] = None) -> List[
     """
     pictures = []
     for index in track(range(len(scene.cameras)), "Exact renders"):
-        camera = scene.cameras[index : index + 1]
-        camera = (camera if longest is None else resized(camera, longest)).to(scene.model.device)
+        camera = pinholes(scene.cameras[index : index + 1], longest).to(scene.model.device)
         pictures.append({key: value.cpu() for key, value in exact_outputs(scene.model, camera).items()})
     return pictures

@@ -8,7 +8,7 @@ fastest axis; each byte of a plane is the difference, modulo 256, from the one b
 import base64
 import gzip
 from pathlib import Path
-from typing import Callable, Dict, Sequence, Tuple
+from typing import Callable, Dict, Tuple
 
 import numpy as np
 import torch
@@ -16,12 +16,11 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace, Space
-from sparsestyle_ns.export.orbit import Orbit, make_orbit, most_central, resized, survey
+from sparsestyle_ns.export.orbit import Orbit, make_orbit, most_central, pinholes, survey
 from sparsestyle_ns.export.points import MIN_ACCUMULATION
 from sparsestyle_ns.export.stylised_scene import StylisedScene, exact_pictures
 from sparsestyle_ns.export.voxel_grid import EMPTY, ROUNDING, VoxelGrid, bake_voxels, picture_of_voxels
 from sparsestyle_ns.metrics.image import psnr
-from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_output
@@ -53,14 +52,14 @@ def export_page(scene: StylisedScene, output_path: Path, resolution: int) -> Non
     views = survey(orbit, cameras)
     voxels, page = fit_page(
         lambda cells: bake_voxels(model, cells, views),
-        lambda voxels: build_page(voxels, model, cameras, scene.names, orbit, scene.title),
+        lambda voxels: build_page(voxels, scene, orbit),
         resolution,
     )
     write_output(output_path, page, "The page", "scene.html")
     print(f"{voxels.resolution} cells along a side, {len(page) / 1e6:.1f} MB")
     errors = []
     for index, (name, picture) in enumerate(zip(scene.names, exact, strict=True)):
-        shown = picture_of_voxels(voxels, model, resized(cameras[index : index + 1], COMPARED_SIDE))
+        shown = picture_of_voxels(voxels, model, pinholes(cameras[index : index + 1], COMPARED_SIDE))
         errors.append(psnr(shown, picture["rgb"]))
         print(f"PSNR to the exact render, view of {name}: {errors[-1]:.1f} dB")
     height, width = exact[0]["rgb"].shape[:2]
@@ -106,18 +105,11 @@ def fit_page(
         resolution = smaller
 
 
-def build_page(
-    voxels: VoxelGrid, model: HierStyleModel, cameras: Cameras, names: Sequence[str], orbit: Orbit, title: str
-) -> bytes:
-    """The page's HTML.
-
-    Args:
-        voxels: the model's.
-        cameras: pinholes that it may be looked at with, one for each name.
-        title: plain text.
-    """
+def build_page(voxels: VoxelGrid, scene: StylisedScene, orbit: Orbit) -> bytes:
+    """The page's HTML, for a scene and its voxels."""
+    model, cameras = scene.model, scene.cameras
     background = torch.zeros(3) if model.background is None else model.background
-    scene = {
+    described = {
         "resolution": voxels.resolution,
         "cells": len(voxels.occupied),
         "known": int(voxels.known.sum()),
@@ -125,11 +117,11 @@ def build_page(
         "background": background.tolist(),
         "density": {"unit": DENSITY_UNIT, "step": DENSITY_STEP, "empty": EMPTY, "rounding": ROUNDING},
         "space": describe_space(model.space),
-        "cameras": [describe_camera(cameras[index], name) for index, name in enumerate(names)],
+        "cameras": [describe_camera(cameras[index], name) for index, name in enumerate(scene.names)],
         "orbit": {**vars(orbit), "target": orbit.target.tolist(), "up": orbit.up.tolist()},
     }
     packed = base64.b64encode(pack(voxels)).decode()
-    return render_page("web_page.html", __package__, title=title, scene=scene, voxels=packed).encode()
+    return render_page("web_page.html", __package__, title=scene.title, scene=described, voxels=packed).encode()
 
 
 def describe_space(space: Space) -> Dict[str, object]:

@@ -1,5 +1,6 @@
 """What the gallery shows of a run: its files, renders of it, a film, and what was measured of it."""
 
+import statistics
 from pathlib import Path
 from typing import Dict, List, Optional, Sequence, Tuple
 
@@ -10,8 +11,8 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from sparsestyle_ns.data.photos import PhotoDataset, at_size
 from sparsestyle_ns.data.view_selection import evenly_spaced
-from sparsestyle_ns.evaluation.held_out import SavedReport, evaluate_held_out, exact_outputs, saved_report
-from sparsestyle_ns.evaluation.tables import report_tables
+from sparsestyle_ns.evaluation.held_out import SavedReport, by_figure, evaluate_held_out, exact_outputs, saved_report
+from sparsestyle_ns.evaluation.tables import Table, report_tables, table_of
 from sparsestyle_ns.gallery.film import as_pixels, make_film
 from sparsestyle_ns.gallery.layout import Film, Picture, RunPictures, View, thumbnail
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
@@ -63,8 +64,7 @@ def collect_run(
         style=_style_picture(painting),
         style_note=f"The style image, {painting}, is no longer there.",
         film=film,
-        figures=_figures(measured),
-        tables=[] if report is None else report_tables(report.means, report.num_views),
+        tables=[_views_table(measured)] if report is None else report_tables(report.means, report.num_views),
         settings=_settings(config, dataset, step),
         effects=pipeline.effects.rows(),
     )
@@ -148,24 +148,12 @@ def _style_picture(path: Optional[Path]) -> Optional[Picture]:
     return Picture(thumbnail(as_pixels(image.permute(1, 2, 0).numpy()), LONGEST_SIDE), path.name)
 
 
-FIGURE_LABELS = {
-    "coarse_psnr": ("Coarse PSNR", "{:.2f} dB"),
-    "coarse_ssim": ("Coarse SSIM", "{:.3f}"),
-    "coarse_lpips": ("Coarse LPIPS", "{:.3f}"),
-    "content_ssim": ("Stylised SSIM to photo", "{:.3f}"),
-}
-
-
-def _figures(measured: Sequence[Dict[str, float]]) -> List[Tuple[str, str]]:
-    """Means over the views of what the model measured, and over how many."""
-    figures = []
-    for key, (label, form) in FIGURE_LABELS.items():
-        values = [metrics[key] for metrics in measured if key in metrics]
-        if values:
-            figures.append((label, form.format(sum(values) / len(values))))
-    if figures:
-        figures.append(("Mean of", f"{len(measured)} view" + "s" * (len(measured) > 1)))
-    return figures
+def _views_table(views: Sequence[Dict[str, float]]) -> Table:
+    """Means over the views that are shown of what the model measured of them."""
+    means = {key: statistics.fmean(values) for key, values in by_figure(views).items()}
+    columns = [(f"coarse_{key}", key, "coarse ") for key in ("psnr", "ssim", "lpips")]
+    columns.append(("content_ssim", "content_ssim", "stylised "))
+    return table_of(f"Mean of the views above, {len(views)}", columns, [("", means)])
 
 
 def _settings(config: TrainerConfig, dataset: PhotoDataset, step: int) -> List[Tuple[str, str]]:

@@ -77,8 +77,7 @@ class RunPictures:
         style: the style image; None where its file is gone.
         style_note: said in its place.
         film: of the stylised scene.
-        figures: (label, value) of measurements of the views that are shown.
-        tables: what was measured of all held-out views; shown instead of `figures`.
+        tables: what was measured.
         settings: (label, value) of how the run was made.
         effects: lines of the table of effects, the first of them its heading.
     """
@@ -91,7 +90,6 @@ class RunPictures:
     style: Optional[Picture] = None
     style_note: str = "The style image is no longer where it was."
     film: Optional[Film] = None
-    figures: List[Tuple[str, str]] = field(default_factory=list)
     tables: List[Table] = field(default_factory=list)
     settings: List[Tuple[str, str]] = field(default_factory=list)
     effects: List[Tuple[str, ...]] = field(default_factory=list)

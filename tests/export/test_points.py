@@ -24,7 +24,7 @@ from sparsestyle_ns.export.points import (
     likeness,
     splat,
     surface_points,
-    without_background,
+    surfaces,
 )
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.rendering.render import over_background
@@ -88,12 +88,15 @@ def test_far_background_and_what_is_hardly_there_make_no_points():
     assert len(surface_points(camera, picture).positions) == 0
 
 
-def test_the_background_is_taken_off_colours():
-    color, background = torch.tensor([0.2, 0.4, 0.6]), torch.tensor([1.0, 1.0, 1.0])
-    accumulation = torch.tensor([[[0.8], [0.0], [1.0]]])
-    picture = {"rgb": accumulation * color + (1 - accumulation) * background, "accumulation": accumulation}
-    rgb = without_background(picture, background)["rgb"]
-    torch.testing.assert_close(rgb[0], torch.stack([color, torch.zeros(3), color]))
+def test_the_background_is_taken_off_colours(ball, monkeypatch):
+    picture, points = ball[0][0], ball[1][0]
+    accumulation, background = 0.8 * picture["accumulation"], torch.tensor([1.0, 1.0, 1.0])
+    rgb = over_background(accumulation * picture["rgb"], accumulation, background)
+    seen = {**picture, "accumulation": accumulation, "rgb": rgb}
+    monkeypatch.setattr(points_module, "exact_pictures", lambda scene: [seen])
+    pictures, parts = surfaces(SimpleNamespace(model=SimpleNamespace(background=background), cameras=cameras()))
+    torch.testing.assert_close(pictures[0]["rgb"], picture["rgb"])
+    torch.testing.assert_close(parts[0].colors, points.colors)
 
 
 def test_a_view_is_like_what_the_points_of_the_others_show(ball):

@@ -9,7 +9,7 @@ from small_scenes import KINDS, NUM_STEPS, balls, psnr, scene
 
 from sparsestyle_ns.core.occupancy import Occupancy
 from sparsestyle_ns.evaluation.held_out import exact_outputs
-from sparsestyle_ns.export.orbit import make_orbit, resized, survey, turned
+from sparsestyle_ns.export.orbit import make_orbit, pinholes, survey, turned
 from sparsestyle_ns.export.stylised_scene import load_scene
 from sparsestyle_ns.export.voxel_grid import VoxelGrid, bake_voxels, last_step_cells, picture_of_voxels, render_voxels
 from sparsestyle_ns.export.web_page import median_depth
@@ -117,7 +117,7 @@ def test_voxels_hold_the_fields_values(exported):
 def test_where_no_empty_space_is_skipped_every_cell_counts(exported):
     """As for a run with `--pipeline.effects.empty-space off`."""
     loaded, _, _ = exported
-    camera, before, baked = resized(loaded.cameras[1:2], 16), loaded.model.occupancy, []
+    camera, before, baked = pinholes(loaded.cameras[1:2], 16), loaded.model.occupancy, []
     for occupancy in (None, Occupancy(4)):
         loaded.model.occupancy = occupancy
         baked.append(bake_voxels(loaded.model, 32, [camera]))

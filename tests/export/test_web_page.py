@@ -26,7 +26,8 @@ SETTLED = "document.body.dataset.state !== 'moving'"
 
 def page_of(kind, title="A scene", names=None):
     small = scene(kind)
-    return build_page(small.voxels, small.model, small.cameras, names or small.names, small.orbit, title)
+    small.title, small.names = title, names or small.names
+    return build_page(small.voxels, small, small.orbit)
 
 
 def unpack(page):

@@ -60,10 +60,10 @@ def test_collect_run_shows_photos_and_held_out_views_wherever_the_run_is_now(run
             assert pixels.shape == (24, 32, 3)
             assert pixels.dtype == np.uint8
     assert dict(run.settings)["Iterations"] == "3 of 3"
-    assert dict(run.figures)["Mean of"] == "2 views"
     assert run.subtitle == "hier-style, 3 photos, 3 iterations"
     assert run.style_name == "painting"
-    assert run.tables == []
+    assert [table.title for table in run.tables] == ["Mean of the views above, 2"]
+    assert run.tables[0].columns[0] == "coarse PSNR dB ↑"
     assert frames_of(run.film.content).shape == (3, 24, 32, 3)
     assert "flight" in run.film.caption
     assert "<video" in gallery_page([run], "A run")
@@ -121,7 +121,7 @@ def test_figures_come_from_the_report_of_the_newest_checkpoint_alone(runs, tmp_p
     assert tables[0].title == "Coarse field, 2 held-out views"
     assert tables[0].rows == [("coarse", ["12.34"])]
     (moved / "evaluation.json").write_text(json.dumps({**report, "step": 1}))
-    assert collect_run(moved, num_views=1, frames=0).tables == []
+    assert collect_run(moved, num_views=1, frames=0).tables[0].title == "Mean of the views above, 1"
     (moved / "evaluation.json").write_text("[1, 2]")
     assert saved_report(moved, 2) is None
 
