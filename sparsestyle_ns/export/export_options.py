@@ -15,15 +15,14 @@ from sparsestyle_ns.utils.files import prepare_output
 class ExportOptions:
     """The options of `sparsestyle export`."""
 
-    run: Annotated[Path, tyro.conf.Positional]
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder or its config.yml."""
     output_path: Path
     """The file to write."""
     format: Literal["html", "ply", "mesh"] = "html"
     """What to write: a page, points or a mesh."""
     resolution: int = 255
-    """html: cells along a side of the scene's cube. 255 fits into the graphics memory that every browser with WebGL2
-    offers."""
+    """html: cells along a side of the scene's cube. Every browser with WebGL2 can hold 255."""
 
     def check(self) -> None:
         """Makes sure that there is such a run, and that the file can be written.

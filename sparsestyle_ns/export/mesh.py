@@ -23,17 +23,18 @@ try:
     import open3d
 except (ImportError, OSError) as error:
     raise InputError(
-        f"Open3D, which makes the mesh, can't be loaded ({error}): install the system's libraries that it needs, on "
-        "Debian and Ubuntu with apt-get install libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6, or choose --format ply."
+        f"Open3D, which makes the mesh, can't be loaded ({error}): install the libraries that it needs, on Debian and "
+        "Ubuntu with apt-get install libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6, or choose --format ply."
     ) from error
 
 OCTREE_DEPTH = 9
 """Levels of the Poisson solver's octree, as in `ns-export poisson`."""
 THIN_SHARE = 0.1
-"""Share of the vertices, those with the fewest points around them, that are no surface (as in `ns-export poisson`)."""
+"""Share of the vertices, those with the fewest points around them, that are dropped (as in `ns-export poisson`)."""
 NORMAL_NEIGHBOURS = 30
 FAR = 4.0
-"""Vertices farther from any point than this many times the points' usual distance from each other are invented."""
+"""Vertices farther from any point than this many times the points' median distance from each other are dropped: the
+reconstruction closes holes with them."""
 MIN_POINTS = 100
 
 

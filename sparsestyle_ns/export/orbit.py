@@ -1,4 +1,4 @@
-"""Cameras of the page: the training views as pinholes, and how far one may turn away from the one it opens with.
+"""Cameras of the page: the training views as pinholes, and how far the user may turn away from the opening one.
 
 A turned camera is the opening one, first pitched about its own right axis and then yawed about the scene's up axis,
 both through a target on its line of sight. The page does the same (`turnedPose` in web_page.js).
@@ -18,12 +18,12 @@ from sparsestyle_ns.core.spaces import BoxSpace, ForwardFacingSpace, Space
 STEEPEST = 85.0
 """Degrees above or below the horizon that a camera may look from."""
 LEAST_TURN, MOST_TURN = 5.0, 30.0
-"""Degrees that a camera may be turned by in a forward-facing scene, wherever its photos were taken: farther out is what
-no photo shows, and the fields there are guesses of which a page and the exact render show different ones."""
+"""Degrees that a camera may be turned by in a forward-facing scene, wherever its photos were taken. Beyond lies what no
+photo shows: the fields have arbitrary values there, and the page would differ from the exact render."""
 BEYOND_PHOTOS = 1.5
 """How far cameras of a forward-facing scene may turn, as a multiple of the largest angle between two photos."""
 SURVEY_SIDE = 96
-"""Pixels along the longer side of the pictures that find out what can be seen."""
+"""Pixels along the longer side of the pictures by which it is found out what can be seen."""
 
 
 @dataclass
@@ -67,12 +67,12 @@ def most_central(cameras: Cameras) -> int:
 
 
 def make_orbit(space: Space, cameras: Cameras, opening: int, depth: float) -> Orbit:
-    """Where one may go from the camera `opening` without leaving what the photos tell of.
+    """Where the camera may go from `opening` and still show what the photos have shown.
 
     Around an object (box) the target is beside its centre, elsewhere at the depth of what the camera sees.
 
     Args:
-        depth: how far what the opening camera sees is away, in world units.
+        depth: distance of what the opening camera sees, in world units.
     """
     pose = cameras.camera_to_worlds[opening]
     position, forward = pose[:, 3], -pose[:, 2]
@@ -84,7 +84,7 @@ def make_orbit(space: Space, cameras: Cameras, opening: int, depth: float) -> Or
         around = torch.nn.functional.normalize(cameras.camera_to_worlds[..., 3] - target, dim=-1)
         widest = math.degrees(math.acos(float((around @ around.T).amin().clamp(-1.0, 1.0))))
         turn = min(max(BEYOND_PHOTOS * widest, LEAST_TURN), MOST_TURN)
-        # NDC has nothing in front of the near plane, and cameras beyond it would see what is behind them.
+        # NDC has nothing in front of the near plane: a camera beyond it would see what is behind it.
         nearest = 1.0 - 0.5 * min(space.near / depth, 1.0)
         return Orbit(opening, target, torch.tensor([0.0, 1.0, 0.0]), (-turn, turn), (-turn, turn), (nearest, 1.3))
     up = torch.tensor([0.0, 0.0, 1.0])  # nerfstudio's worlds stand upright

@@ -10,13 +10,12 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 from torch.nn import functional as F
 
+from sparsestyle_ns.evaluation.held_out import MIN_ACCUMULATION
 from sparsestyle_ns.export.stylised_scene import StylisedScene, exact_pictures
 from sparsestyle_ns.rendering.render import straight_color
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_output
 
-MIN_ACCUMULATION = 0.5
-"""Rays with less weight than this see no surface."""
 MAX_JUMP = 0.1
 """Share by which depth may differ between neighbouring pixels on one surface."""
 MAX_DEPTH = 10.0

@@ -35,7 +35,7 @@ from sparsestyle_ns.utils.progress import track
 EMPTY = 1
 """Code of density 0, as in baked rendering, where 0 stands for a value that isn't known."""
 ROUNDING = 0.05
-"""Part of a code's step that a graphics card's interpolation may be off; less than that above `EMPTY` is empty."""
+"""Error of a graphics card's interpolation, in steps of a code: what is less than this above `EMPTY` is empty."""
 CELLS_PER_CALL = 1 << 16
 
 
@@ -80,14 +80,15 @@ def ray_segments(camera: Cameras, space: Space) -> Iterator[Segments]:
 
 @torch.no_grad()
 def bake_voxels(model: HierStyleModel, resolution: int, cameras: Sequence[Cameras]) -> VoxelGrid:
-    """Evaluates a model's fields wherever one of some cameras may see them, mixed as its pictures show them.
+    """Evaluates a model's fields wherever some cameras may see them, mixed as the model's pictures show them.
 
-    That is in bricks of 8³ cells that their rays reach before 99.9% of the light is gone, in cells that aren't empty.
+    These are the cells that aren't empty, in bricks of 8³ that the cameras' rays reach before 99.9% of the light is
+    gone.
 
     Args:
         model: in evaluation mode.
         resolution: cells along a side of the cube.
-        cameras: one camera each, with a ray for each pixel; a brick should be some pixels wide.
+        cameras: one camera each. A ray is cast for each pixel, so a brick should be some pixels wide.
     """
     volume, config = model.bake(resolution), model.config
     for camera in track(cameras, "Finding what can be seen"):

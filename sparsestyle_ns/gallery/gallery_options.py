@@ -26,8 +26,7 @@ class GalleryOptions:
     num_views: int = 3
     """Held-out views to render of each run."""
     frames: int = 48
-    """Frames of a film, 16 a second; 0 for none. If the photos were taken from all around, the film is a turn about the
-    scene, otherwise a flight through the photos' viewpoints."""
+    """Frames of the film, a flight between the photos' viewpoints or a turn about the scene, 16 a second; 0: none."""
     evaluate: bool = False
     """Measure runs that have no evaluation.json of their newest checkpoint, and save it in their folders."""
 

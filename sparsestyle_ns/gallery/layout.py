@@ -34,21 +34,15 @@ class View:
         name: what kind of view it is and which.
         stylised: the stylised render.
         coarse: the render before stylising.
-        photo: the photo taken there, where there is one.
+        photo: the photo taken there.
         depth: the stylised scene's depth, as a picture.
     """
 
     name: str
     stylised: Pixels
     coarse: Pixels
-    photo: Optional[Pixels] = None
-    depth: Optional[Pixels] = None
-
-    @property
-    def pictures(self) -> Dict[str, Pixels]:
-        """The pictures that there are, by their captions, in the order of the page."""
-        every = {"Photo": self.photo, "Coarse": self.coarse, "Stylised": self.stylised, "Depth": self.depth}
-        return {caption: pixels for caption, pixels in every.items() if pixels is not None}
+    photo: Pixels
+    depth: Pixels
 
 
 @dataclass
@@ -98,11 +92,6 @@ class RunPictures:
     def heading(self) -> str:
         """Scene and painting."""
         return f"{self.name} · {self.style_name}" if self.style_name else self.name
-
-    @property
-    def same_columns(self) -> bool:
-        """Whether all views have the same kinds of pictures."""
-        return len({tuple(view.pictures) for view in self.views}) == 1
 
 
 def gallery_page(runs: Sequence[RunPictures], title: str) -> str:

@@ -131,7 +131,7 @@ def view():
     from sparsestyle_ns.gallery.layout import View
 
     picture = np.zeros((4, 4, 3), np.uint8)
-    return View("view", picture, picture)
+    return View("view", picture, picture, picture, picture)
 
 
 def test_the_viewer_shows_the_table() -> None:

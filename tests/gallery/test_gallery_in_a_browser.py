@@ -25,7 +25,7 @@ def tab(tmp_path_factory):
     wide = Table("Consistency", ["a rather long heading of a column"] * 9, [("stylised", ["0.1234"] * 9)])
     effects = [("effect", "why"), ("ndc", "the cameras look one way, and depth has no end " * 3)]
     run = make_run(
-        views=[View("held-out view 0", plain(RED), plain(BLUE), plain((9, 9, 9)))],
+        views=[View("held-out view 0", plain(RED), plain(BLUE), plain((9, 9, 9)), plain((90, 90, 90)))],
         film=Film(encode_mp4(turning), "A turn"),
         tables=[wide],
         effects=effects,

@@ -22,14 +22,14 @@ def make_pixels(seed, height=6, width=8):
 
 
 def make_run(**changes):
-    """A run with three photos and two views, the second of them without photo and depth."""
+    """A run with three photos and two views."""
     run = {
         "name": "fern",
         "subtitle": "hier-style, 3 photos, 200 iterations",
         "photos": [Picture(make_pixels(i), f"image00{i}.png") for i in range(3)],
         "views": [
-            View("held-out view 0", make_pixels(10), make_pixels(11), make_pixels(12), make_pixels(13)),
-            View("held-out view 8", make_pixels(14), make_pixels(15)),
+            View("held-out view 0", *map(make_pixels, range(10, 14))),
+            View("held-out view 8", *map(make_pixels, range(14, 18))),
         ],
         "style_name": "night",
         "style": Picture(make_pixels(20), "night.jpg"),
@@ -81,7 +81,7 @@ def test_page_holds_every_picture_and_the_film():
     sources = set(Page(gallery_page([run], "Stylised scenes")).values("src"))
     pictures = [photo.pixels for photo in run.photos] + [run.style.pixels]
     for view in run.views:
-        pictures += [view.stylised, view.coarse, *(p for p in (view.photo, view.depth) if p is not None)]
+        pictures += [view.stylised, view.coarse, view.photo, view.depth]
     expected = {data_uri(pixels) for pixels in pictures}
     assert sources == expected | {"data:video/mp4;base64," + base64.b64encode(MP4).decode()}
 
@@ -119,7 +119,7 @@ def test_names_are_text_never_markup():
         name=attack,
         subtitle=attack,
         photos=[Picture(make_pixels(0), attack)],
-        views=[View(attack, make_pixels(1), make_pixels(2))],
+        views=[View(attack, *map(make_pixels, range(1, 5)))],
         style_name=attack,
         style=None,
         style_note=attack,
@@ -192,7 +192,7 @@ def test_one_run_has_no_grid():
 
 
 def test_the_grids_pictures_are_small():
-    large = View("view", make_pixels(1, 400, 500), make_pixels(2, 400, 500))
+    large = View("view", *(make_pixels(seed, 400, 500) for seed in range(4)))
     grid = grid_of([make_run(views=[large]), make_run(style_name="hat", views=[large])])[2]
     assert max(map(int, re.findall(r'width="(\d+)"', grid))) == THUMBNAIL_SIDE
 

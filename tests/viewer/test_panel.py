@@ -28,7 +28,7 @@ from PIL import Image
 from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.export.stylised_scene import load_scene
-from sparsestyle_ns.gallery.collect import collect_run
+from sparsestyle_ns.gallery.make_gallery import collect_run
 from sparsestyle_ns.models.hier_style import MOST_BAKED
 from sparsestyle_ns.pipelines.hier_style import StepLosses
 from sparsestyle_ns.runs.run_folder import find_config, load_run

@@ -14,9 +14,9 @@ from PIL import Image
 
 from sparsestyle_ns.core.camera_paths import axes_meet, measuring_path, showing_path
 from sparsestyle_ns.evaluation.held_out import saved_report
-from sparsestyle_ns.gallery.collect import collect_run, depth_picture
 from sparsestyle_ns.gallery.film import FRAMES_PER_SECOND, encode_mp4, make_film, read_film
 from sparsestyle_ns.gallery.layout import gallery_page
+from sparsestyle_ns.gallery.make_gallery import collect_run, depth_picture
 from sparsestyle_ns.runs.coarse_run import newest_checkpoint
 from sparsestyle_ns.utils.errors import InputError
 
