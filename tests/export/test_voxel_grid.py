@@ -9,9 +9,10 @@ from small_scenes import KINDS, NUM_STEPS, balls, psnr, scene
 
 from sparsestyle_ns.core.occupancy import Occupancy
 from sparsestyle_ns.evaluation.held_out import exact_outputs
-from sparsestyle_ns.export.command import load_scene, median_depth, page_picture
-from sparsestyle_ns.export.orbit import make_orbit, resized, survey, turned
-from sparsestyle_ns.export.voxels import Voxels, bake_voxels, interpolate, last_step_cells, render_voxels
+from sparsestyle_ns.export.orbit import make_orbit, pinholes, survey, turned
+from sparsestyle_ns.export.stylised_scene import load_scene
+from sparsestyle_ns.export.voxel_grid import VoxelGrid, bake_voxels, last_step_cells, picture_of_voxels, render_voxels
+from sparsestyle_ns.export.web_page import median_depth
 from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT
 from sparsestyle_ns.rendering.mixing import Mix
 
@@ -20,19 +21,19 @@ def test_interpolation_is_exact_for_what_is_linear():
     axis = torch.arange(5)
     x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
     codes = torch.stack([10 + x, 20 + 3 * y, 5 * z, x + y + z], dim=-1).to(torch.uint8)
-    voxels = Voxels(codes, torch.ones(5, 5, 5, dtype=torch.bool), torch.ones(2, 2, 2, dtype=torch.bool))
+    voxels = VoxelGrid(codes, torch.ones(5, 5, 5, dtype=torch.bool), torch.ones(2, 2, 2, dtype=torch.bool))
     points = 2.0 * torch.rand(100, 3, generator=torch.Generator().manual_seed(0)) - 1.0
     x, y, z = (2.0 * points + 2.0).unbind(-1)
-    torch.testing.assert_close(interpolate(voxels, points), torch.stack([10 + x, 20 + 3 * y, 5 * z, x + y + z], dim=-1))
+    torch.testing.assert_close(voxels.interpolate(points), torch.stack([10 + x, 20 + 3 * y, 5 * z, x + y + z], dim=-1))
     corner = torch.tensor([[1.5, 1.0, -3.0]])
-    torch.testing.assert_close(interpolate(voxels, corner), codes[4, 4, 0].float()[None])
+    torch.testing.assert_close(voxels.interpolate(corner), codes[4, 4, 0].float()[None])
 
 
 def test_a_ray_through_voxels_is_the_sum_over_its_samples():
     """Volume rendering in one loop, as it is written in books."""
     small = scene("box")
     camera = small.cameras[:1]
-    picture = page_picture(small.voxels, small.model, camera)
+    picture = picture_of_voxels(small.voxels, small.model, camera)
     for row, column in ((24, 30), (20, 40), (30, 18)):
         coords = torch.tensor([row + 0.5, column + 0.5])
         bundle = camera.generate_rays(camera_indices=0, coords=coords)
@@ -43,7 +44,7 @@ def test_a_ray_through_voxels_is_the_sum_over_its_samples():
             cell = tuple(((0.5 * position[0] + 0.5) * 12).long().clamp(0, 11).tolist())
             if not small.voxels.occupied[cell]:
                 continue
-            code, *shade = interpolate(small.voxels, position)[0].tolist()
+            code, *shade = small.voxels.interpolate(position)[0].tolist()
             density = DENSITY_UNIT * math.expm1(DENSITY_STEP * (code - 1)) if code > 1.05 else 0.0
             alpha = 1 - math.exp(-density * float(segments.extent.norm()) / NUM_STEPS)
             color, light = color + light * alpha * torch.tensor(shade) / 255, light * (1 - alpha)
@@ -75,12 +76,12 @@ def test_cells_of_the_last_step_are_known(kind):
 
 def test_fog_outside_of_what_is_occupied_counts_only_in_the_last_step():
     small = scene("ndc")
-    empty = Voxels(small.voxels.codes, small.voxels.known, torch.zeros_like(small.voxels.occupied))
-    before = page_picture(empty, small.model, small.cameras[:1])
+    empty = VoxelGrid(small.voxels.codes, small.voxels.known, torch.zeros_like(small.voxels.occupied))
+    before = picture_of_voxels(empty, small.model, small.cameras[:1])
     assert torch.equal(before, torch.zeros_like(before))
     foggy = balls(31, 12)
     foggy.codes[..., -1, :] = torch.tensor([60, 0, 255, 0], dtype=torch.uint8)
-    after = page_picture(Voxels(foggy.codes, foggy.known, empty.occupied), small.model, small.cameras[:1])
+    after = picture_of_voxels(VoxelGrid(foggy.codes, foggy.known, empty.occupied), small.model, small.cameras[:1])
     assert after[..., 1].mean() > 0.5
 
 
@@ -99,7 +100,7 @@ def test_turned_views_that_no_photo_shows_are_there_as_well(exported):
     for yaw, pitch in ((4.0, -3.0), (-5.0, 2.0)):
         camera = turned(orbit, loaded.cameras, yaw, pitch)
         exact = exact_outputs(loaded.model, camera)["rgb"]
-        assert psnr(page_picture(voxels, loaded.model, camera), exact) > 33
+        assert psnr(picture_of_voxels(voxels, loaded.model, camera), exact) > 33
 
 
 def test_voxels_hold_the_fields_values(exported):
@@ -116,7 +117,7 @@ def test_voxels_hold_the_fields_values(exported):
 def test_where_no_empty_space_is_skipped_every_cell_counts(exported):
     """As for a run with `--pipeline.effects.empty-space off`."""
     loaded, _, _ = exported
-    camera, before, baked = resized(loaded.cameras[1:2], 16), loaded.model.occupancy, []
+    camera, before, baked = pinholes(loaded.cameras[1:2], 16), loaded.model.occupancy, []
     for occupancy in (None, Occupancy(4)):
         loaded.model.occupancy = occupancy
         baked.append(bake_voxels(loaded.model, 32, [camera]))
@@ -134,5 +135,5 @@ def test_a_run_whose_config_asks_for_less_of_the_style_is_exported_so(exported, 
     loaded.model.display.own = replace(before, mix=mix)
     voxels, exact = bake_voxels(loaded.model, 95, [camera]), exact_outputs(loaded.model, camera)["rgb"]
     loaded.model.display.own = before
-    assert psnr(page_picture(voxels, loaded.model, camera), exact) > 33
+    assert psnr(picture_of_voxels(voxels, loaded.model, camera), exact) > 33
     assert psnr(exact, exact_outputs(loaded.model, camera)["rgb"]) < 30

@@ -15,9 +15,9 @@ from PIL import Image
 from sparsestyle_ns.core.camera_geometry import meeting_point
 from sparsestyle_ns.core.camera_paths import measuring_path, showing_path
 from sparsestyle_ns.evaluation.held_out import saved_report
-from sparsestyle_ns.gallery.collect import collect_run, depth_picture
-from sparsestyle_ns.gallery.film import FRAMES_PER_SECOND, encode_mp4, make_film
-from sparsestyle_ns.gallery.page import gallery_page, read_film
+from sparsestyle_ns.gallery.film import FRAMES_PER_SECOND, encode_mp4, make_film, read_film
+from sparsestyle_ns.gallery.layout import gallery_page
+from sparsestyle_ns.gallery.make_gallery import collect_run, depth_picture
 from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 from sparsestyle_ns.utils.errors import InputError
 
@@ -61,10 +61,10 @@ def test_collect_run_shows_photos_and_held_out_views_wherever_the_run_is_now(run
             assert pixels.shape == (24, 32, 3)
             assert pixels.dtype == np.uint8
     assert dict(run.settings)["Iterations"] == "3 of 3"
-    assert dict(run.figures)["Mean of"] == "2 views"
     assert run.subtitle == "hier-style, 3 photos, 3 iterations"
     assert run.style_name == "painting"
-    assert run.tables == []
+    assert [table.title for table in run.tables] == ["Mean of the views above, 2"]
+    assert run.tables[0].columns[0] == "coarse PSNR dB ↑"
     assert frames_of(run.film.content).shape == (3, 24, 32, 3)
     assert "flight" in run.film.caption
     assert "<video" in gallery_page([run], "A run")
@@ -122,7 +122,7 @@ def test_figures_come_from_the_report_of_the_newest_checkpoint_alone(runs, tmp_p
     assert tables[0].title == "Coarse field, 2 held-out views"
     assert tables[0].rows == [("coarse", ["12.34"])]
     (moved / "evaluation.json").write_text(json.dumps({**report, "step": 1}))
-    assert collect_run(moved, num_views=1, frames=0).tables == []
+    assert collect_run(moved, num_views=1, frames=0).tables[0].title == "Mean of the views above, 1"
     (moved / "evaluation.json").write_text("[1, 2]")
     assert saved_report(moved, 2) is None
 
@@ -144,7 +144,7 @@ def test_a_run_whose_folder_takes_no_report_is_measured_and_shown_all_the_same(r
     (moved / "evaluation.json").mkdir()
     shown = collect_run(moved, num_views=1, frames=0, evaluate=True)
     assert [table.title.split(",")[0] for table in shown.tables][:2] == ["Coarse field", "Style and content"]
-    assert f"evaluation.json can't be left in {moved} (Is a directory); its figures are" in capsys.readouterr().out
+    assert f"evaluation.json can't be saved in {moved} (Is a directory); its figures are" in capsys.readouterr().out
 
 
 def frames_of(content):

@@ -1,7 +1,11 @@
 """The page carries the scene whole and nothing from elsewhere, and shows in a browser what its twin in torch says."""
 
+import base64
+import gzip
+import json
 import re
 
+import numpy as np
 import pytest
 import torch
 from chromium import needs_chromium, open_tab
@@ -11,9 +15,9 @@ from small_scenes import HEIGHT, KINDS, WIDTH, psnr, scene
 from torchvision.transforms.functional import to_tensor
 
 from sparsestyle_ns.cli import main
-from sparsestyle_ns.export.command import page_picture
 from sparsestyle_ns.export.orbit import turned
-from sparsestyle_ns.export.page import build_page, fit_page, unpack
+from sparsestyle_ns.export.voxel_grid import EMPTY, VoxelGrid, picture_of_voxels
+from sparsestyle_ns.export.web_page import build_page, fit_page
 from sparsestyle_ns.utils.errors import InputError
 
 READY = "document.body.dataset.state === 'ready'"
@@ -22,7 +26,28 @@ SETTLED = "document.body.dataset.state !== 'moving'"
 
 def page_of(kind, title="A scene", names=None):
     small = scene(kind)
-    return build_page(small.voxels, small.model, small.cameras, names or small.names, small.orbit, title)
+    small.title, small.names = title, names or small.names
+    return build_page(small.voxels, small, small.orbit)
+
+
+def unpack(page):
+    """What a page says of its scene, and the voxels that it carries, read as web_page.py describes them."""
+    text = page.decode()
+    told, packed = (
+        re.search(f'<script id="{name}"[^>]*>(.*?)</script>', text, re.DOTALL)[1] for name in ("scene", "voxels")
+    )
+    told = json.loads(told)
+    data = np.frombuffer(gzip.decompress(base64.b64decode(packed)), np.uint8)
+    sides = told["cells"], told["resolution"] + 1
+    occupied, known, planes = np.split(data, np.cumsum([-(-(side**3) // 8) for side in sides]))
+    occupied, known = (
+        torch.from_numpy(np.unpackbits(bits, count=side**3, bitorder="little").astype(bool)).view(side, side, side)
+        for bits, side in zip((occupied, known), sides, strict=True)
+    )
+    codes = torch.zeros(*known.shape, 4, dtype=torch.uint8)
+    codes[..., 0] = EMPTY
+    codes[known] = torch.from_numpy(np.cumsum(planes.reshape(4, -1), axis=1, dtype=np.uint8).T.copy())
+    return told, VoxelGrid(codes, known, occupied)
 
 
 def shown(tab):
@@ -51,7 +76,7 @@ def test_the_same_scene_gives_the_same_file():
 def test_the_page_asks_nothing_of_a_network():
     text = page_of("ndc").decode()
     assert "default-src 'none'" in text
-    assert not re.search(r"https?://|\bsrc=|\bhref=|@import|fetch\(", text)
+    assert not re.search(r'https?://|\b(src|href)="(?!data:)|@import|fetch\(', text)
 
 
 def test_titles_and_file_names_are_text_never_markup():
@@ -68,10 +93,10 @@ def test_a_page_that_is_too_large_gets_fewer_cells():
         tried.append(resolution)
         return resolution
 
-    page = fit_page(bake, lambda resolution: bytes(resolution**3), 100, max_bytes=600_000)
+    voxels, page = fit_page(bake, lambda resolution: bytes(resolution**3), 100, max_bytes=600_000)
     assert tried == [100, 82]  # the cube root of 0.95 · 0.6 is 0.829
-    assert page.voxels == 82
-    assert len(page.content) <= 600_000
+    assert voxels == 82
+    assert len(page) <= 600_000
 
 
 def test_a_scene_that_does_not_fit_is_refused():
@@ -87,7 +112,7 @@ def test_a_browser_shows_what_the_twin_in_torch_says(tab, tmp_path, kind):
     for view in (0, 2):
         tab.open(f"{path.as_uri()}#view={view}&size={WIDTH}x{HEIGHT}")
         tab.wait_for(READY)
-        expected = page_picture(small.voxels, small.model, small.cameras[view : view + 1])
+        expected = picture_of_voxels(small.voxels, small.model, small.cameras[view : view + 1])
         assert expected.std() > 0.05  # there is something to see
         # A screen has 256 shades: rounding alone leaves 59 dB. Cells' borders are where float32 puts them.
         assert psnr(shown(tab), expected) > 45
@@ -105,10 +130,10 @@ def test_dragging_turns_the_camera_as_the_orbit_says(tab, tmp_path, kind):
     tab.mouse("mouseReleased", 20, 30, button="left")
     tab.wait_for(READY)
     degrees = 180 / 480
-    expected = page_picture(
+    expected = picture_of_voxels(
         small.voxels, small.model, turned(small.orbit, small.cameras, yaw=20 * degrees, pitch=6 * degrees)
     )
-    before = page_picture(small.voxels, small.model, small.cameras[:1])
+    before = picture_of_voxels(small.voxels, small.model, small.cameras[:1])
     assert psnr(before, expected) < 30
     assert psnr(shown(tab), expected) > 45
 

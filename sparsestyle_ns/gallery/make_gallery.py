@@ -1,66 +1,82 @@
-"""What the gallery shows of a run: its files, renders of it, a film, and what was measured of it."""
+"""`sparsestyle gallery`: what its page shows of runs is their files, renders, films, and what was measured of them."""
 
+import statistics
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Sequence, Tuple
+from typing import Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
+from nerfstudio.engine.trainer import TrainerConfig
 
 from sparsestyle_ns.data.photos import PhotoDataset, at_size
 from sparsestyle_ns.data.view_selection import evenly_spaced
+from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.engine.loading import load_run
-from sparsestyle_ns.evaluation.held_out import SavedReport, exact_outputs, saved_report
-from sparsestyle_ns.evaluation.tables import report_tables
-from sparsestyle_ns.gallery.film import as_pixels, make_film
-from sparsestyle_ns.gallery.page import Picture, RunPictures, View, read_film
+from sparsestyle_ns.evaluation.held_out import SavedReport, by_figure, exact_outputs, saved_report
+from sparsestyle_ns.evaluation.tables import Table, report_tables, table_of
+from sparsestyle_ns.gallery.film import as_pixels, make_film, read_film
+from sparsestyle_ns.gallery.gallery_options import GalleryOptions
+from sparsestyle_ns.gallery.layout import Film, Picture, RunPictures, View, gallery_page, thumbnail
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
 from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.page import Pixels
+from sparsestyle_ns.utils.page import Pixels, write_page
 from sparsestyle_ns.utils.progress import say, track
 
 LONGEST_SIDE = 512
 """Pixels that a picture on the page has at most along its longer side."""
 
 
+def make_gallery(options: GalleryOptions) -> None:
+    """Writes the page, and says where it is.
+
+    Args:
+        options: checked.
+
+    Raises:
+        InputError: a run or a video can't be used.
+    """
+    films = list(map(read_film, options.video))  # rendering takes minutes, so what can fail before does
+    runs = []
+    for run, film in zip_longest(options.runs, films):
+        say(f"Showing {run}")
+        runs.append(collect_run(run, film, options.num_views, options.frames, options.evaluate))
+    page = write_page(gallery_page(runs, options.title), options.output_path)
+    first = find_config(options.runs[0]).parent
+    finish(page, ["sparsestyle", "export", first, "--format", "html", "--output-path", "scene.html"])
+
+
 def collect_run(
-    config_path: Path, video: Optional[Path] = None, num_views: int = 3, frames: int = 48, evaluate: bool = False
+    run: Path, film: Optional[Film] = None, num_views: int = 3, frames: int = 48, evaluate: bool = False
 ) -> RunPictures:
     """Loads a stylised run, renders what the page shows of it, and finds out what was measured of it.
 
     Args:
-        config_path: the run's config.yml, or its folder. The run may have been moved since it was made.
-        video: an MP4 file to show instead of a film that is made here.
+        run: its folder or its config.yml. The run may have been moved since it was made.
+        film: what to show instead of a film that is made here.
         num_views: held-out views to render, evenly spaced; fewer where there are fewer.
         frames: of the film; 0 for none.
         evaluate: whether to measure the run as `sparsestyle evaluate` does, where its folder has no report of its
-            newest checkpoint; the report is then left there, if that can be. Without one, the views that are shown are
-            measured.
+            newest checkpoint; the report is then saved there, if that can be. Without a report, the views that are
+            shown are measured.
 
     Raises:
-        InputError: it isn't a finished run of this package, its photos are gone, or the video can't be read.
+        InputError: it isn't a finished run of this package, or its photos are gone.
     """
-    config_path = find_config(config_path, STYLE_METHOD)
-    film = None if video is None else read_film(video)
-    if num_views < 1:
-        raise InputError(f"--num-views is {num_views}; at least one view is needed.")
+    config_path = find_config(run, STYLE_METHOD)
     config, pipeline, step = load_run(config_path)
-    dataset, held_out = pipeline.datamanager.train_dataset, pipeline.datamanager.eval_dataset
+    dataset = pipeline.datamanager.train_dataset
     originals = _at_full_size(dataset)
     photos = [Picture(_photo(originals, index), path.name) for index, path in enumerate(originals.image_filenames)]
-    views, measured = _render_views(pipeline, held_out, num_views)
+    views, measured = _render_views(pipeline, num_views)
     if film is None and frames > 0:
         film = make_film(pipeline.model, dataset.cameras, frames, LONGEST_SIDE)
     report = saved_report(config_path.parent, step)
     if report is None and evaluate:
-        made = pipeline.held_out_report()
-        report = SavedReport(made.means, len(made.views))
-        try:
-            made.save(config_path.parent / REPORT_FILE, config.experiment_name, config.method_name, step)
-        except OSError as error:
-            say(f"{REPORT_FILE} can't be left in {config_path.parent} ({error.strerror}); its figures are on the page.")
+        report = _evaluate(config_path.parent, config, pipeline, step)
     painting = config.pipeline.style_image
     return RunPictures(
         name=Path(config.experiment_name).name,
@@ -71,15 +87,25 @@ def collect_run(
         style=_style_picture(painting),
         style_note=f"The style image, {painting}, is no longer there.",
         film=film,
-        figures=_figures(measured),
-        tables=[] if report is None else report_tables(report.means, report.num_views),
+        tables=[_views_table(measured)] if report is None else report_tables(report.means, report.num_views),
         settings=_settings(config, dataset, step),
         effects=pipeline.effects.rows(),
     )
 
 
-def _render_views(pipeline: Any, dataset: PhotoDataset, num_views: int) -> Tuple[List[View], List[Dict[str, float]]]:
+def _evaluate(folder: Path, config: TrainerConfig, pipeline: HierStylePipeline, step: int) -> SavedReport:
+    """Measures a run on all held-out views, and saves the report in its folder, if that can be."""
+    report = pipeline.held_out_report()
+    try:
+        report.save(folder / REPORT_FILE, config.experiment_name, config.method_name, step)
+    except OSError as error:
+        say(f"{REPORT_FILE} can't be saved in {folder} ({error.strerror}); its figures are on the page.")
+    return SavedReport(report.means, len(report.views))
+
+
+def _render_views(pipeline: HierStylePipeline, num_views: int) -> Tuple[List[View], List[Dict[str, float]]]:
     """Held-out views with their photos, and what the model measures of each."""
+    dataset = pipeline.datamanager.eval_dataset
     trained = set(pipeline.datamanager.train_dataset.image_filenames)
     originals = _at_full_size(dataset)
     views, measured = [], []
@@ -96,20 +122,21 @@ def _render_views(pipeline: Any, dataset: PhotoDataset, num_views: int) -> Tuple
                 outputs, {"image": torch.from_numpy(photo).to(pipeline.device) / 255.0}
             )
         measured.append(metrics)
+        arrays = {key: value.cpu().numpy() for key, value in outputs.items()}
         views.append(
             View(
                 name=f"{'Training view' if path in trained else 'Held-out view'} {path.name}",
-                stylised=as_pixels(outputs["rgb"].cpu().numpy()),
-                coarse=as_pixels(outputs["rgb_coarse"].cpu().numpy()),
+                stylised=as_pixels(arrays["rgb"]),
+                coarse=as_pixels(arrays["rgb_coarse"]),
                 photo=photo,
-                depth=depth_picture(outputs["depth"].cpu().numpy(), outputs["accumulation"].cpu().numpy()),
+                depth=depth_picture(arrays["depth"], arrays["accumulation"]),
             )
         )
     return views, measured
 
 
 def depth_picture(depth: Float[np.ndarray, "H W 1"], accumulation: Float[np.ndarray, "H W 1"]) -> Pixels:
-    """Depth as shades, near light and far dark, with the background in the middle grey of nothing.
+    """Depth as shades, near light and far dark; where there is nothing, middle grey.
 
     The shade is linear in 1 / depth, between the 2nd and the 98th percentile of what is seen, so that a far wall
     doesn't take all shades from the things before it.
@@ -118,10 +145,9 @@ def depth_picture(depth: Float[np.ndarray, "H W 1"], accumulation: Float[np.ndar
     weight = np.clip(accumulation, 0.0, 1.0)
     seen = nearness[weight[..., 0] > 0.5]
     far, near = np.percentile(seen, (2, 98)) if seen.size else (0.0, 1.0)
-    share = np.clip((nearness - far) / max(near - far, 1e-9), 0.0, 1.0)[..., None]
-    dark, light = np.array([0.10, 0.13, 0.22]), np.array([0.98, 0.93, 0.82])
-    middle = np.array([0.72, 0.38, 0.30])
-    shade = np.where(share < 0.5, dark + (middle - dark) * 2 * share, middle + (light - middle) * (2 * share - 1))
+    share = np.clip((nearness - far) / max(near - far, 1e-9), 0.0, 1.0)
+    shades = np.array([[0.10, 0.13, 0.22], [0.72, 0.38, 0.30], [0.98, 0.93, 0.82]])  # far, middle, near
+    shade = np.stack([np.interp(share, (0.0, 0.5, 1.0), channel) for channel in shades.T], axis=-1)
     return as_pixels(shade * weight + 0.5 * (1.0 - weight))
 
 
@@ -131,49 +157,33 @@ def _at_full_size(dataset: PhotoDataset) -> PhotoDataset:
 
 
 def _photo(dataset: PhotoDataset, index: int) -> Pixels:
-    """A photo of a dataset, at most 512 pixels along its longer side."""
-    return _fitted(Image.fromarray(dataset.get_image_uint8(index)[..., :3].numpy()))
-
-
-def _fitted(image: Image.Image) -> Pixels:
-    image.thumbnail((LONGEST_SIDE, LONGEST_SIDE), Image.Resampling.LANCZOS)
-    return np.array(image)
+    return thumbnail(dataset.get_image_uint8(index)[..., :3].numpy(), LONGEST_SIDE)
 
 
 def _style_picture(path: Optional[Path]) -> Optional[Picture]:
+    """The painting, where its file is still there."""
     if path is None:
         return None
     try:
         image = Painting.read(path).pixels
     except InputError:
         return None
-    return Picture(_fitted(Image.fromarray(as_pixels(image.permute(1, 2, 0).numpy()))), path.name)
+    return Picture(thumbnail(as_pixels(image.permute(1, 2, 0).numpy()), LONGEST_SIDE), path.name)
 
 
-FIGURE_LABELS = {
-    "coarse_psnr": ("Coarse PSNR", "{:.2f} dB"),
-    "coarse_ssim": ("Coarse SSIM", "{:.3f}"),
-    "coarse_lpips": ("Coarse LPIPS", "{:.3f}"),
-    "content_ssim": ("Stylised SSIM to photo", "{:.3f}"),
-}
+def _views_table(views: Sequence[Dict[str, float]]) -> Table:
+    """Means over the views that are shown of what the model measured of them."""
+    means = {key: statistics.fmean(values) for key, values in by_figure(views).items()}
+    columns = [(f"coarse_{key}", key, "coarse ") for key in ("psnr", "ssim", "lpips")]
+    columns.append(("content_ssim", "content_ssim", "stylised "))
+    return table_of(f"Mean of the views above, {len(views)}", columns, [("", means)])
 
 
-def _figures(measured: Sequence[Dict[str, float]]) -> List[Tuple[str, str]]:
-    """Means over the views of what the model measured, and over how many."""
-    figures = []
-    for key, (label, form) in FIGURE_LABELS.items():
-        values = [metrics[key] for metrics in measured if key in metrics]
-        if values:
-            figures.append((label, form.format(sum(values) / len(values))))
-    if figures:
-        figures.append(("Mean of", f"{len(measured)} view" + "s" * (len(measured) > 1)))
-    return figures
-
-
-def _settings(config: Any, dataset: Any, step: int) -> List[Tuple[str, str]]:
+def _settings(config: TrainerConfig, dataset: PhotoDataset, step: int) -> List[Tuple[str, str]]:
     pipeline = config.pipeline
     height, width = int(dataset.cameras.height[0]), int(dataset.cameras.width[0])
-    weight = pipeline.loss_weights["content"]
+    first = pipeline.loss_weights["content"]
+    last = first * pipeline.content_decay
     return [
         ("Method", config.method_name),
         ("Made", config.timestamp),
@@ -184,9 +194,6 @@ def _settings(config: Any, dataset: Any, step: int) -> List[Tuple[str, str]]:
         ("Style image", "none" if pipeline.style_image is None else pipeline.style_image.name),
         ("Feature network", pipeline.backbone if pipeline.vgg_weights is None else pipeline.vgg_weights.name),
         ("Size it sees views at", f"{pipeline.feature_side} pixels"),
-        (
-            "Content weight λ",
-            f"{weight:g} to {weight * pipeline.content_decay:g} in {pipeline.content_steps} iterations",
-        ),
+        ("Content weight λ", f"{first:g} to {last:g} in {pipeline.content_steps} iterations"),
         ("Warm start", f"{pipeline.warm_start_steps} steps"),
     ]

@@ -1,6 +1,6 @@
 #version 300 es
-// One ray a pixel through the voxels of a stylised scene, with the steps of the exact render: rendering/volume.py and
-// rendering/space.py say the same in Python, export/voxels.py with these voxels.
+// One ray a pixel through the voxels of a stylised scene, with the steps of the exact render. core/spaces.py and
+// rendering/render.py do the same in Python, export/voxel_grid.py with these voxels.
 precision highp float;
 precision highp int;
 precision highp sampler3D;

@@ -21,7 +21,7 @@ async function unpack(text) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/** Occupancy as a byte a cell, and four bytes a voxel (colour, density), from the layout that page.py describes. */
+/** Occupancy as a byte a cell, and four bytes a voxel (colour, density), from the layout that web_page.py describes. */
 function readVoxels(bytes) {
   const cells = scene.cells ** 3;
   const voxels = (scene.resolution + 1) ** 3;
