@@ -23,7 +23,8 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from benchmarks._measure import CACHE, ROOT, Measure, Options, Report, device_name, ratio_of_pairs, timed
 from benchmarks._scene import COARSE_METHOD
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.effects.registry import EFFECTS, EffectSettings
+from sparsestyle_ns.effects.base import EffectSettings
+from sparsestyle_ns.effects.registry import EFFECTS, decide
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, gather_pixels
@@ -87,8 +88,9 @@ def stage_1(name: str, report: Report) -> Dict[str, Measure]:
 def photos(layout: str, flags: Tuple[str, ...], settings: Dict[str, str], report: Report) -> FewShotDataManager:
     """A scene's photos, with some effects set."""
     config = config_of(COARSE_METHOD, layout, make_scene(layout, flags, report.options.quick), settings).pipeline
-    config.datamanager.effects = config.effects
-    return config.datamanager.setup(device="cpu", test_mode="inference")
+    manager = config.datamanager.setup(device="cpu", test_mode="inference")
+    manager.set_effects(decide(manager.scene, config.effects))
+    return manager
 
 
 def lens_distortion(report: Report) -> Dict[str, Measure]:
@@ -127,7 +129,7 @@ def residual_density(report: Report) -> Dict[str, Measure]:
     def contender(on: bool) -> Measure:
         effects = manager.effects.replaced(dataclasses.replace(decision, on=on))
         model = method_config("hier-style-draft").pipeline.model.setup(
-            scene_box=dataset.scene_box, num_train_data=len(dataset), metadata=dataset.metadata | {"effects": effects}
+            scene_box=dataset.scene_box, num_train_data=len(dataset), effects=effects, ndc=manager.scene.ndc
         )
         frozen = model.to(report.device).freeze(origins, directions)
         return timed(lambda: model.stylised(frozen).rgb.square().mean().backward(), report.device)

@@ -18,7 +18,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from benchmarks._measure import Duration, Measure, Options, Report, ratio_of_pairs, timed
 from benchmarks._scene import COARSE_METHOD, Scene, at_size, find_scene, load_photos
-from sparsestyle_ns.effects.registry import EffectSettings
+from sparsestyle_ns.effects.base import EffectSettings
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.metrics.image import psnr
@@ -126,7 +126,7 @@ def vanilla_config(scene: Scene, options: Stage1Options) -> Any:
     # Rays to matched points have no colours, and this method knows of nothing else.
     ours.effects = EffectSettings(matched_depth="off")
     method.pipeline.datamanager = ours
-    near, far = load_photos(scene).train_dataparser_outputs.metadata["ndc_depth_range"]
+    near, far = load_photos(scene).scene.ndc.depth_range
     method.pipeline.model.collider_params = {"near_plane": near, "far_plane": far}
     return method
 

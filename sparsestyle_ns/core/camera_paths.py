@@ -14,14 +14,13 @@ from nerfstudio.cameras.camera_utils import get_interpolated_poses
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from sparsestyle_ns.core.camera_geometry import is_forward_facing, meeting_point
 from sparsestyle_ns.utils.errors import InputError
 
 NUM_FRAMES = 24
 """Frames of the path, at least."""
 ARC_STEP = math.radians(2.0)
 """Angle between neighbouring frames of an arc."""
-FACING = math.cos(math.radians(60.0))
-"""Cameras all of whose view directions are at least this close (cosine) to their mean look one way."""
 FLIGHT_STEPS = 20
 """Poses of a flight that a frame chooses from, so that its speed can change without jerks."""
 
@@ -42,7 +41,7 @@ def measuring_path(cameras: Cameras) -> Cameras:
     if len(cameras) < 2:
         raise InputError("Consistency is measured between training views, and there is one; train on two or more.")
     poses = cameras.camera_to_worlds.cpu().float()
-    return at_poses(poses_between(poses) if look_one_way(poses) else poses_around(poses), cameras)
+    return at_poses(poses_between(poses) if is_forward_facing(poses) else poses_around(poses), cameras)
 
 
 def showing_path(cameras: Cameras, frames: int) -> Cameras:
@@ -56,7 +55,7 @@ def showing_path(cameras: Cameras, frames: int) -> Cameras:
         frames: how many; the last is just before the first.
     """
     poses = cameras.camera_to_worlds.cpu().float()
-    if not look_one_way(poses):
+    if not is_forward_facing(poses):
         return unseen_places(cameras, frames)
     fine = poses_between(poses, FLIGHT_STEPS * frames)
     place = 0.5 - 0.5 * torch.cos(torch.arange(frames) * (2.0 * math.pi / frames))
@@ -75,16 +74,9 @@ def unseen_places(cameras: Cameras, count: int) -> Cameras:
     """
     # In float64, whose rounding, which differs with where vectors lie in memory, doesn't reach the float32 result.
     poses = cameras.camera_to_worlds.cpu().double()
-    if look_one_way(poses):
+    if is_forward_facing(poses):
         return at_poses(poses_between(poses, count), cameras)
     return at_poses(poses_around(poses, 2.0 * math.pi / count, count), cameras)
-
-
-def look_one_way(poses: Float[Tensor, "cameras 3 4"]) -> bool:
-    """Whether no camera looks farther than `FACING` aside from the mean direction."""
-    forward = -poses[:, :, 2]
-    mean = torch.nn.functional.normalize(forward.mean(dim=0), dim=0)
-    return bool((forward @ mean > FACING).all())
 
 
 def at_poses(poses: Float[Tensor, "frames 3 4"], cameras: Cameras) -> Cameras:
@@ -110,7 +102,7 @@ def poses_around(
     poses: Float[Tensor, "cameras 3 4"], step: float = ARC_STEP, frames: int = NUM_FRAMES
 ) -> Float[Tensor, "frames 3 4"]:
     """An arc of so many poses, `step` radians apart, around the point closest to all optical axes, with z up."""
-    center = axes_meet(poses)
+    center = meeting_point(poses)
     offsets = poses[:, :, 3] - center
     height = offsets[:, 2].mean()
     radius = offsets[:, :2].norm(dim=-1).mean()
@@ -122,10 +114,3 @@ def poses_around(
     back = torch.nn.functional.normalize(positions - center, dim=-1)
     right = torch.nn.functional.normalize(torch.linalg.cross(back.new_tensor([[0.0, 0.0, 1.0]]), back), dim=-1)
     return torch.stack([right, torch.linalg.cross(back, right), back, positions], dim=-1)
-
-
-def axes_meet(poses: Float[Tensor, "cameras 3 4"]) -> Float[Tensor, "3"]:
-    """The point with the smallest sum of squared distances to the cameras' optical axes."""
-    axes = poses[:, :, 2]
-    across = torch.eye(3, dtype=poses.dtype) - axes[:, :, None] * axes[:, None, :]
-    return torch.linalg.lstsq(across.sum(dim=0), (across @ poses[:, :, 3:]).sum(dim=0)).solution[:, 0]

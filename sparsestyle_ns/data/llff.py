@@ -27,7 +27,8 @@ from torch.nn import functional as F
 
 from sparsestyle_ns.core.ndc import ndc_rays
 from sparsestyle_ns.data.parser_choice import advice
-from sparsestyle_ns.data.photos import check_one_size, open_photo, photo_size
+from sparsestyle_ns.data.photos import check_one_size, images_in, open_photo, photo_size
+from sparsestyle_ns.data.scene_info import NDC, SCENE_INFO, SceneInfo
 from sparsestyle_ns.utils.errors import InputError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -35,6 +36,8 @@ NDC_NEAR = 1.0
 """Distance of NDC's near plane in the scaled world."""
 DEPTH_MARGIN = 0.1
 """Share by which the bounds of depth are widened: LLFF's are percentiles of sparse points."""
+USUAL_NUM_VIEWS = 3
+"""Views to train on by default (RegNeRF's); a folder with no more of them than `eval_interval` is trained on whole."""
 BOX_MARGIN = 0.05
 """How far the scene box reaches beyond what the cameras see, on each side, as a part of its width."""
 
@@ -71,23 +74,14 @@ class LLFFCameras(NamedTuple):
     """Distances along the viewing direction of the nearest and the farthest thing seen."""
 
 
-@dataclass
 class LLFFDataParser(DataParser):
     """Reads an LLFF folder.
 
-    The outputs' `metadata` tells the model and the datamanager what nerfstudio has no field for:
-
-    - `space`: "ndc": the scene box is in NDC, and rays are to be mapped there (`rendering/ndc.py`);
-    - `ndc_focal_over_half_size`: (2f/w, 2f/h), and `ndc_near`: 1.0, the arguments of that map;
-    - `view_ids` and `view_names`: which of the sorted images this split has, and their file names;
-    - `ndc_depth_range`: depth of the nearest and the farthest thing that any view sees, with a margin;
-    - `bounds`: [num_views_of_split, 2], near and far bound of each view in the scaled world's units.
+    The `SceneInfo` in the outputs' metadata has the map to NDC, with bounds of depth that are widened by
+    `DEPTH_MARGIN`; a view's id is its place among the sorted images.
     """
 
     config: LLFFDataParserConfig
-
-    def __init__(self, config: LLFFDataParserConfig):
-        super().__init__(config=config)
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         """Reads the folder and returns one split of it: "train", or "val" and "test", which are the held-out views.
@@ -96,20 +90,21 @@ class LLFFDataParser(DataParser):
             InputError: if the folder or a setting cannot be used.
         """
         self._check_settings()
-        llff_cameras = read_poses_bounds(self.config.data)
-        filenames = find_images(self.config.data, self.config.downscale_factor, num_poses=len(llff_cameras.focals))
-        width, height = read_image_size(filenames, llff_cameras.full_sizes)
+        folder, interval = self.config.data, self.config.eval_interval
+        read = read_poses_bounds(folder)
+        filenames = find_images(folder, self.config.downscale_factor, num_poses=len(read.focals))
+        width, height = read_image_size(filenames, read.full_sizes)
 
         # All views take part in recentring and scaling, so that the world does not depend on the split.
-        transform = recentring_transform(llff_cameras.camera_to_worlds)
-        scale = 1.0 / (self.config.bound_scale * llff_cameras.bounds.min().item())
-        camera_to_worlds = transform[:, :3] @ llff_cameras.camera_to_worlds
+        transform = recentring_transform(read.camera_to_worlds)
+        scale = 1.0 / (self.config.bound_scale * read.bounds.min().item())
+        camera_to_worlds = transform[:, :3] @ read.camera_to_worlds
         camera_to_worlds[..., 3] = scale * (camera_to_worlds[..., 3] + transform[:, 3])
 
-        focals = llff_cameras.focals * width / llff_cameras.full_sizes[:, 0]
+        focals = read.focals * width / read.full_sizes[:, 0]
         # NDC is one space for all views, and the focal length is only its unit of x and y.
         focal = focals.mean().item()
-        focal_over_half_size = (2 * focal / width, 2 * focal / height)
+        ndc = NDC((2 * focal / width, 2 * focal / height), NDC_NEAR, depth_range(scale * read.bounds))
 
         view_ids = self._view_ids(split, len(filenames))
         cameras = Cameras(
@@ -122,36 +117,24 @@ class LLFFDataParser(DataParser):
             height=height,
             camera_type=CameraType.PERSPECTIVE,
         )
+        num_views = len(view_ids) if len(view_ids) <= interval else USUAL_NUM_VIEWS
         return DataparserOutputs(
             image_filenames=[filenames[i] for i in view_ids],
             cameras=cameras,
-            scene_box=ndc_scene_box(camera_to_worlds, focals, (width, height), focal_over_half_size, filenames),
+            scene_box=ndc_scene_box(camera_to_worlds, focals, (width, height), ndc.focal_over_half_size, filenames),
             dataparser_scale=scale,
             dataparser_transform=transform.float(),
-            metadata={
-                "space": "ndc",
-                "ndc_focal_over_half_size": focal_over_half_size,
-                "ndc_near": NDC_NEAR,
-                "ndc_depth_range": depth_range(scale * llff_cameras.bounds),
-                "view_ids": view_ids,
-                "view_names": [filenames[i].name for i in view_ids],
-                "bounds": (scale * llff_cameras.bounds[view_ids]).float(),
-            },
+            metadata={SCENE_INFO: SceneInfo(tuple(view_ids), ndc, default_num_views=num_views)},
         )
 
     def _check_settings(self) -> None:
-        if self.config.eval_interval < 2:
-            raise InputError(
-                f"--eval-interval {self.config.eval_interval} would leave no image to train on: give 2 or more."
-            )
-        if not 0 < self.config.bound_scale < math.inf:
-            raise InputError(
-                f"--bound-scale {self.config.bound_scale} is no scale: give a number above 0, such as 0.75."
-            )
-        if self.config.downscale_factor is not None and self.config.downscale_factor < 1:
-            raise InputError(
-                f"--downscale-factor {self.config.downscale_factor} names no folder: give N for images_N, 1 for images."
-            )
+        interval, scale, factor = self.config.eval_interval, self.config.bound_scale, self.config.downscale_factor
+        if interval < 2:
+            raise InputError(f"--eval-interval {interval} would leave no image to train on: give 2 or more.")
+        if not 0 < scale < math.inf:
+            raise InputError(f"--bound-scale {scale} is no scale: give a number above 0, such as 0.75.")
+        if factor is not None and factor < 1:
+            raise InputError(f"--downscale-factor {factor} names no folder: give N for images_N, 1 for images.")
 
     def _view_ids(self, split: str, num_views: int) -> List[int]:
         """Indices into the sorted images of the views in a split."""
@@ -207,9 +190,7 @@ def _load_rows(path: Path) -> Float[Tensor, "num_views 17"]:
             "something else under that name: fetch or make it again."
         ) from error
     if not isinstance(rows, np.ndarray) or rows.dtype.kind not in "fiu":
-        raise InputError(
-            f"{path} is not one array of real numbers: fetch it again, or make it with LLFF's imgs2poses.py."
-        )
+        raise InputError(f"{path} is not one array of real numbers: make it with LLFF's imgs2poses.py.")
     if rows.ndim != 2 or rows.shape[0] == 0 or rows.shape[1] != 17:
         raise InputError(
             f"{path} has the shape {rows.shape} in place of (number of images, 17), a 3x5 pose and two bounds a row: "
@@ -254,20 +235,15 @@ def find_images(folder: Path, downscale_factor: Optional[int], num_poses: int) -
     Raises:
         InputError: if there is no such folder, no image in it, or another number of images than poses.
     """
-    if downscale_factor is None:
-        names = ["images_8", "images_4", "images"]
-    else:
+    names = ["images_8", "images_4", "images"]
+    if downscale_factor is not None:
         names = ["images" if downscale_factor == 1 else f"images_{downscale_factor}"]
     image_folder = next((folder / name for name in names if (folder / name).is_dir()), None)
     if image_folder is None:
         there = sorted(path.name for path in folder.glob("images*") if path.is_dir())
         advice = f"choose from {', '.join(there)} with --downscale-factor" if there else "put the photos into images"
         raise InputError(f"{folder} has no folder {' or '.join(names)}: {advice}.")
-    filenames = sorted(
-        path
-        for path in image_folder.iterdir()
-        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
-    )
+    filenames = images_in(image_folder, IMAGE_SUFFIXES)
     if not filenames:
         raise InputError(
             f"{image_folder} has no .jpg, .jpeg or .png image: put the photos there, "
@@ -282,7 +258,7 @@ def find_images(folder: Path, downscale_factor: Optional[int], num_poses: int) -
 
 
 def read_image_size(filenames: List[Path], full_sizes: Float[Tensor, "num_views 2"]) -> Tuple[int, int]:
-    """Width and height in pixels that all the images share, after each was decoded once to see that it can be.
+    """Width and height in pixels that all the images share; each is decoded once to see that it can be.
 
     Args:
         filenames: one image for each pose.
@@ -296,21 +272,15 @@ def read_image_size(filenames: List[Path], full_sizes: Float[Tensor, "num_views 
         open_photo(filename, draft=True)
     check_one_size(filenames)
     width, height = photo_size(filenames[0])
-    for filename, full_size in zip(filenames, full_sizes.tolist(), strict=True):
-        if not _same_aspect((width, height), full_size):
+    for filename, (full_width, full_height) in zip(filenames, full_sizes.tolist(), strict=True):
+        # Scaled by one factor, both sides are less than a pixel off.
+        if abs(width * full_height - height * full_width) >= full_width + full_height:
             raise InputError(
                 f"{filename} is {width}x{height} pixels, which is no scaled version of the "
-                f"{full_size[0]:g}x{full_size[1]:g} that poses_bounds.npy was made for: scale the original photos "
+                f"{full_width:g}x{full_height:g} that poses_bounds.npy was made for: scale the original photos "
                 "without cropping or turning them."
             )
     return width, height
-
-
-def _same_aspect(size: Tuple[int, int], full_size: Tuple[float, float]) -> bool:
-    """Whether one factor takes both sides of `full_size` to less than a pixel from `size`."""
-    least = max((side - 1) / full_side for side, full_side in zip(size, full_size, strict=True))
-    most = min((side + 1) / full_side for side, full_side in zip(size, full_size, strict=True))
-    return least < most
 
 
 def recentring_transform(camera_to_worlds: Float[Tensor, "num_views 3 4"]) -> Float[Tensor, "3 4"]:

@@ -1,8 +1,7 @@
 """The same surface points in different photos, found by matching and checked against the cameras.
 
-SIFT keypoints are matched in both directions with Lowe's ratio test; a match counts where it obeys the epipolar
-geometry of the two known cameras within a pixel. Colours are those of blurred photos, so that a match that is off by a
-fraction of a pixel doesn't count as a difference.
+A match of two features counts where it obeys the epipolar geometry of the two known cameras within a pixel. Colours are
+those of blurred photos, so that a match that is off by a fraction of a pixel doesn't count as a difference.
 """
 
 from dataclasses import dataclass
@@ -16,9 +15,10 @@ from jaxtyping import Float, Int
 from nerfstudio.cameras.camera_utils import radial_and_tangential_undistort
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-MAX_KEYPOINTS = 2000
-MAX_RATIO = 0.8
-"""Lowe's ratio: the best match's distance over the second best's."""
+from sparsestyle_ns.data.features import Features, find_features, mutual_matches
+
+MAX_FEATURES, MIN_CONTRAST, MAX_RATIO = 2000, 0.02, 0.8
+"""Of the matcher (`features`); lenient, as the known cameras sort out wrong matches."""
 MAX_EPIPOLAR_ERROR = 1.0
 """Sampson distance, in pixels, up to which a match obeys the cameras."""
 BLUR = 2.0
@@ -63,7 +63,7 @@ class PointMatches:
 
 
 @dataclass
-class Rays:
+class PixelRays:
     """Directions of image points in a camera.
 
     Attributes:
@@ -74,17 +74,26 @@ class Rays:
     directions: Float[np.ndarray, "points 3"]
     tangents: Float[np.ndarray, "points 3 2"]
 
-    def __getitem__(self, index: Int[np.ndarray, "some"]) -> "Rays":
+    def __getitem__(self, index: Int[np.ndarray, "some"]) -> "PixelRays":
         """Some of them."""
-        return Rays(self.directions[index], self.tangents[index])
+        return PixelRays(self.directions[index], self.tangents[index])
 
 
 @dataclass
-class _Keypoints:
-    points: Float[np.ndarray, "points 2"]
-    rays: Rays
-    descriptors: Float[np.ndarray, "points 128"]
-    scale: float
+class _View:
+    """A photo whose points can be matched.
+
+    Attributes:
+        features: of the photo.
+        rays: where the camera sees them.
+        blurred: the photo, for colours.
+        pixel: side of a pixel over the focal length.
+    """
+
+    features: Features
+    rays: PixelRays
+    blurred: Float[np.ndarray, "H W 4"]
+    pixel: float
 
 
 def match_points(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras) -> PointMatches:
@@ -94,29 +103,43 @@ def match_points(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras)
         photos: RGBA in [0, 1].
         cameras: one for each, for images of any size with the same aspect.
     """
-    keypoints = [find_keypoints(photo, cameras, index) for index, photo in enumerate(photos)]
-    blurred = [cv2.GaussianBlur(photo, (0, 0), BLUR) for photo in photos]
+    views = [_look_at(photo, cameras, index) for index, photo in enumerate(photos)]
     poses = cameras.camera_to_worlds.double().numpy()
     found: List[Tuple[np.ndarray, ...]] = []
     for first, second in neighbouring_pairs(poses):
-        one, other = keypoints[first], keypoints[second]
+        one, other = views[first], views[second]
         if one is None or other is None:
             continue
-        here, there = mutual_matches(one.descriptors, other.descriptors)
+        here, there = mutual_matches(one.features.descriptors, other.features.descriptors, MAX_RATIO)
         error = epipolar_error(one.rays[here], other.rays[there], poses[first], poses[second])
-        fits = error < MAX_EPIPOLAR_ERROR * max(one.scale, other.scale)
+        fits = error < MAX_EPIPOLAR_ERROR * max(one.pixel, other.pixel)
         here, there = here[fits], there[fits]
-        colors = sample(blurred[first], one.points[here]), sample(blurred[second], other.points[there])
+        colors = sample(one.blurred, one.features.points[here]), sample(other.blurred, other.features.points[there])
         directions = (
             in_world(one.rays.directions[here], poses[first]),
             in_world(other.rays.directions[there], poses[second]),
         )
         opaque = (colors[0][:, 3] > 0.99) & (colors[1][:, 3] > 0.99)
-        views = np.full(len(here), first), np.full(len(here), second)
-        found.append((*(each[opaque] for each in views), *(each[opaque, :3] for each in (*colors, *directions))))
+        numbers = np.full(len(here), first), np.full(len(here), second)
+        found.append((*(each[opaque] for each in numbers), *(each[opaque, :3] for each in (*colors, *directions))))
     empty = (np.zeros(0, int), np.zeros(0, int), *(np.zeros((0, 3)) for _ in range(4)))
     columns = [np.concatenate(parts) for parts in zip(empty, *found, strict=True)]
     return PointMatches(*columns, num_views=len(photos))
+
+
+def _look_at(photo: Float[np.ndarray, "H W 4"], cameras: Cameras, index: int) -> Optional[_View]:
+    """What matching needs of a photo; None where its camera is no `LENSES`."""
+    kind = CameraType(int(cameras.camera_type[index]))
+    if kind not in LENSES:
+        return None
+    grey = (255.0 * (photo[..., :3] * photo[..., 3:]).mean(axis=-1)).astype(np.uint8)
+    features = find_features(grey, MAX_FEATURES, MIN_CONTRAST)
+    pixels = float(cameras.width[index]) / photo.shape[1]
+    center = np.array([float(cameras.cx[index]), float(cameras.cy[index])])
+    focal = np.array([float(cameras.fx[index]), float(cameras.fy[index])])
+    at = ((0.5 + features.points) * pixels - center) / focal
+    rays = rays_of(undistorted(at, cameras, index), kind)
+    return _View(features, rays, cv2.GaussianBlur(photo, (0, 0), BLUR), pixels / focal.mean())
 
 
 def in_world(rays: Float[np.ndarray, "points 3"], pose: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "points 3"]:
@@ -157,25 +180,6 @@ def neighbouring_pairs(poses: Float[np.ndarray, "views 3 4"]) -> List[Tuple[int,
     return [pair for pair in combinations(range(len(poses)), 2) if pair in wanted]
 
 
-def find_keypoints(photo: Float[np.ndarray, "H W 4"], cameras: Cameras, index: int) -> Optional[_Keypoints]:
-    """SIFT keypoints of a photo with their rays; None where there are fewer than two, or its camera is no `LENSES`."""
-    kind = CameraType(int(cameras.camera_type[index]))
-    if kind not in LENSES:
-        return None
-    grey = (255.0 * (photo[..., :3] * photo[..., 3:]).mean(axis=-1)).astype(np.uint8)
-    found, descriptors = cv2.SIFT_create(nfeatures=MAX_KEYPOINTS, contrastThreshold=0.02).detectAndCompute(grey, None)
-    if len(found) < 2:
-        return None
-    points = np.array([keypoint.pt for keypoint in found])
-    pixels = float(cameras.width[index]) / photo.shape[1]
-    at = (0.5 + points) * pixels - np.array([float(cameras.cx[index]), float(cameras.cy[index])])
-    focal = np.array([float(cameras.fx[index]), float(cameras.fy[index])])
-    rays = rays_of(undistorted(at / focal, cameras, index), kind)
-    # Square roots of the L1-normalised descriptor: Hellinger's distance (Arandjelović and Zisserman 2012).
-    descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
-    return _Keypoints(points, rays, descriptors, scale=pixels / focal.mean())
-
-
 def undistorted(points: Float[np.ndarray, "points 2"], cameras: Cameras, index: int) -> Float[np.ndarray, "points 2"]:
     """Image points over the focal length, freed from the lens's distortion.
 
@@ -186,7 +190,7 @@ def undistorted(points: Float[np.ndarray, "points 2"], cameras: Cameras, index: 
     return radial_and_tangential_undistort(torch.from_numpy(points), cameras.distortion_params[index].double()).numpy()
 
 
-def rays_of(points: Float[np.ndarray, "points 2"], kind: CameraType) -> Rays:
+def rays_of(points: Float[np.ndarray, "points 2"], kind: CameraType) -> PixelRays:
     """Where a camera without distortion looks.
 
     A perspective camera's points lie on the plane at the distance 1. A fisheye's are as far from the middle as the
@@ -210,7 +214,7 @@ def rays_of(points: Float[np.ndarray, "points 2"], kind: CameraType) -> Rays:
     directions = np.stack([aside * x, -aside * y, -ahead], axis=-1)
     right = np.stack([aside + slope * x * x, -slope * x * y, along * x], axis=-1)
     down = np.stack([slope * x * y, -aside - slope * y * y, along * y], axis=-1)
-    return Rays(directions, np.stack([right, down], axis=-1))
+    return PixelRays(directions, np.stack([right, down], axis=-1))
 
 
 def why_unmatched(cameras: Cameras) -> Optional[str]:
@@ -222,21 +226,9 @@ def why_unmatched(cameras: Cameras) -> Optional[str]:
     return f"points are matched between perspective and fisheye cameras, and some here are {names}"
 
 
-def mutual_matches(
-    first: Float[np.ndarray, "points 128"], second: Float[np.ndarray, "points 128"]
-) -> Tuple[Int[np.ndarray, "matches"], Int[np.ndarray, "matches"]]:
-    """Which unit descriptors are each other's nearest, and much nearer than the second nearest."""
-    similarity = first @ second.T
-    best = similarity.argmax(axis=1)
-    two = np.partition(similarity, -2, axis=1)[:, -2:]
-    distances = np.sqrt(np.maximum(2.0 - 2.0 * two, 0.0))
-    good = (similarity.argmax(axis=0)[best] == np.arange(len(first))) & (distances[:, 1] < MAX_RATIO * distances[:, 0])
-    return good.nonzero()[0], best[good]
-
-
 def epipolar_error(
-    first: Rays,
-    second: Rays,
+    first: PixelRays,
+    second: PixelRays,
     pose_first: Float[np.ndarray, "3 4"],
     pose_second: Float[np.ndarray, "3 4"],
 ) -> Float[np.ndarray, "matches"]:

@@ -1,7 +1,10 @@
-"""Which dataparser reads a scene, as far as its name or the scene's files tell."""
+"""Which dataparser reads a scene: as the command line says, or as the scene's files tell."""
 
 from pathlib import Path
-from typing import Optional
+from typing import Optional, Sequence
+
+import tyro
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 
 from sparsestyle_ns.utils.errors import InputError
 
@@ -10,7 +13,7 @@ MARKERS = {
     "transforms_train.json": "blender-data",
     "transforms.json": "nerfstudio-data",
 }
-"""What a scene's folder has in it, and which dataparser reads it."""
+"""Files that tell a scene's dataparser."""
 
 
 def marker_of(folder: Path) -> Optional[str]:
@@ -19,9 +22,10 @@ def marker_of(folder: Path) -> Optional[str]:
 
 
 def advice(folder: Path, missing: str) -> str:
-    """The end of a sentence that says that a file is missing in a scene's folder: which dataparser to name instead.
+    """The end of an error message about a missing file: which dataparser to name instead.
 
     Args:
+        folder: the scene's.
         missing: the file that another dataparser looked for.
 
     Returns:
@@ -31,6 +35,32 @@ def advice(folder: Path, missing: str) -> str:
     if marker is None or marker == missing:
         return ""
     return f"; it has {marker}, which {MARKERS[marker]} reads: put {MARKERS[marker]} at the end of the command"
+
+
+def parse_dataparser(words: Sequence[str], data: Path) -> DataParserConfig:
+    """A dataparser's config from its name and options, as after ns-train; without them from what the folder holds.
+
+    Args:
+        words: such as `["colmap", "--colmap-path", "sparse/0"]`; empty for the dataparser that the files tell.
+        data: the scene's folder or file.
+
+    Raises:
+        InputError: there is no such dataparser or scene, or nothing tells which dataparser reads it.
+    """
+    from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion  # which loads this package's llff-data
+
+    if words:
+        check_parser(words[0])
+    if not data.exists():
+        raise InputError(f"There is no {data}; name a scene's folder with --data.")
+    if not words:
+        marker = marker_of(data)
+        if marker is None:
+            raise InputError(
+                f"{data} has none of {', '.join(MARKERS)}, so the dataparser isn't known; name it last, such as colmap."
+            )
+        words = [MARKERS[marker]]
+    return tyro.cli(AnnotatedDataParserUnion, args=list(words), prog="sparsestyle")
 
 
 def check_parser(name: str) -> None:

@@ -3,7 +3,7 @@
 import copy
 from collections import Counter
 from pathlib import Path
-from typing import Any, Dict, Literal, Sequence, Tuple
+from typing import Any, Dict, List, Literal, Sequence, Tuple
 
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -20,6 +20,15 @@ SMALLEST_SIDE = 8
 """Pixels a side below which a photo shows nothing."""
 DARKEST = 3
 """Of 255: a photo with nothing brighter is black, but for the noise of its compression."""
+
+
+def images_in(folder: Path, suffixes: Sequence[str]) -> List[Path]:
+    """The files in a folder with one of these suffixes, sorted by name; hidden files are passed over."""
+    return sorted(
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in suffixes and not path.name.startswith(".") and path.is_file()
+    )
 
 
 def open_photo(path: Path, draft: bool = False) -> Image.Image:

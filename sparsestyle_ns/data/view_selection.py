@@ -7,9 +7,6 @@ from sparsestyle_ns.utils.errors import InputError
 BLENDER_VIEWS = (26, 86, 2, 55, 75, 93, 16, 73)
 """The eight frames of `transforms_train.json` that DietNeRF and FreeNeRF train on."""
 
-DEFAULT_NUM_VIEWS = {"llff": 3, "other": 8}
-"""Views by default, for forward-facing captures and for others."""
-
 
 def evenly_spaced(count: int, num_views: int) -> Tuple[int, ...]:
     """`num_views` of 0 … count − 1, evenly spaced from first to last (RegNeRF's rule, with Python's rounding)."""

@@ -1,6 +1,6 @@
-"""Which effects a scene calls for: measured in one place, decided once, with the reason.
+"""Which parts of the simulation a scene needs: each is measured, and decided once, with the reason.
 
-Adding one: a class in a file here that says what it measures and what it builds (`base.Effect`), and its line in
-`registry.EFFECTS`. Setting, table and record follow from it; the place that needs what it builds asks
-`Decisions.build`, which gives None where it is off.
+To add an effect: write a file here with a function that measures a scene and the `Effect` (`base.py`), list it in
+`registry.EFFECTS`, and give it a field in `base.EffectSettings`. The table, the record and the viewer follow. Whoever
+simulates it asks `decisions.on(name)`, or calls a function of the effect's own file that builds what is needed.
 """

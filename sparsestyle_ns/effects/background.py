@@ -1,33 +1,31 @@
-"""A colour behind the scene."""
+"""The colour of rays that meet nothing: that behind transparent photos, or that of a border of one colour."""
 
-from typing import Any, Dict, List
+from typing import Optional
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestyle_ns.effects.base import Effect, Measurement
+from sparsestyle_ns.effects.base import Decisions, Effect, Measurement
 from sparsestyle_ns.effects.layouts import MIN_EMPTY_BORDER
 from sparsestyle_ns.effects.scene import Scene
 
 
-class Background(Effect):
-    """What rays that meet nothing show: the colour behind transparent photos, or that of a constant border."""
-
-    name = "background"
-    help = "Background colour: photos have transparency or a border of one colour."
-
-    def measure(self, scene: Scene) -> Measurement:
-        """See `Effect.measure`; the share of the photos' border that shows nothing."""
-        found = {"value": scene.empty_border, "threshold": MIN_EMPTY_BORDER}
-        color = scene.background_color
-        words = f"RGB {', '.join(f'{value:.2f}' for value in color)}"
-        found["parameters"] = {"color": color}
-        if scene.empty_border < MIN_EMPTY_BORDER:
-            return Measurement(False, "of the border is empty: photos show no background colour", **found)
+def measure_background(scene: Scene) -> Measurement:
+    """The share of the photos' border that shows nothing, and the colour there."""
+    color = scene.background_color
+    reason = "of the photos' border is empty, too little to tell a background colour"
+    on = scene.empty_border >= MIN_EMPTY_BORDER
+    if on:
         kind = "is transparent" if scene.transparent else "has one colour"
-        return Measurement(True, f"of the border {kind}; {words}", **found)
+        reason = f"of the photos' border {kind}: RGB {', '.join(f'{value:.2f}' for value in color)}"
+    return Measurement(on, reason, scene.empty_border, MIN_EMPTY_BORDER, {"color": color})
 
-    def build(self, parameters: Dict[str, List[float]], **needs: Any) -> Float[Tensor, "3"]:
-        """See `Effect.build`; the colour."""
-        return torch.tensor(parameters["color"])
+
+BACKGROUND = Effect("background", measure_background)
+
+
+def background_color(effects: Decisions) -> Optional[Float[Tensor, "3"]]:
+    """The RGB colour behind the scene, in [0, 1]; None where nothing is behind it."""
+    decision = effects["background"]
+    return torch.tensor(decision.parameters["color"]) if decision.on else None

@@ -1,14 +1,12 @@
-"""What an effect is, and what has been decided about all of them.
+"""What an effect is, how the command line sets it, and what was decided about all of them.
 
-An effect is a part of how a scene is simulated that some scenes need and others don't. It says what it measures of a
-scene and builds what it needs; what is off is never built. `Decisions` is all that the rest of the package sees.
+An effect is a part of the simulation that some scenes need and others don't. What is off is never built.
 """
 
 import json
-from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Dict, List, Literal, Optional, Tuple
+from typing import Any, Callable, Dict, List, Literal, Optional, Tuple
 
 from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.utils.errors import InputError
@@ -19,16 +17,44 @@ FILE_NAME = "effects.json"
 
 
 @dataclass(frozen=True)
+class EffectSettings:
+    """Which effects are simulated: auto measures whether the scene needs them, on and off overrule the measurement."""
+
+    ndc: EffectChoice = "auto"
+    """Normalised device coordinates: for cameras that all face one way, with things at any depth before them."""
+    box: EffectChoice = "auto"
+    """Bounded box: for an object with nothing behind it, seen from all around."""
+    contraction: EffectChoice = "auto"
+    """Contracted unbounded space: for a scene with a background on all sides."""
+    background: EffectChoice = "auto"
+    """Background colour: for photos with transparency, or with a border of one colour."""
+    view_color: EffectChoice = "auto"
+    """View-dependent colour: where a point's colour differs between photos by more than noise and exposure explain."""
+    exposure: EffectChoice = "auto"
+    """Exposure and white balance of each photo: where photos differ in brightness or tint."""
+    lens_distortion: EffectChoice = "auto"
+    """Lens distortion: where the cameras' distortion parameters move pixels."""
+    matched_depth: EffectChoice = "auto"
+    """Depth of points that two photos share, found by matching."""
+    empty_space: EffectChoice = "auto"
+    """Empty-space skipping: where enough of space is empty; decided again while stage 1 trains."""
+    residual_density: EffectChoice = "auto"
+    """Residual density in stage 2, as in the paper; off where the coarse geometry can be trusted."""
+    palette: EffectChoice = "auto"
+    """Palette transfer: where the painting's colours differ from the photos'."""
+
+
+@dataclass(frozen=True)
 class Measurement:
-    """What an effect found out about a scene.
+    """What was measured of a scene for one effect.
 
     Attributes:
-        on: whether the scene calls for the effect.
-        reason: why, in words.
+        on: whether the scene needs the effect.
+        reason: why. Where there is a value, the text goes on from it: "0.31", "of space is empty".
         value: what was measured; None where nothing could be.
-        threshold: what it was compared with; None where nothing is.
+        threshold: what it was compared with; None where there is nothing to compare with.
         parameters: numbers that building the effect needs, by name.
-        possible: whether it could be built for this scene at all; else the reason says what is missing.
+        possible: whether the effect can be simulated for this scene at all; if not, the reason says what is missing.
     """
 
     on: bool
@@ -39,33 +65,21 @@ class Measurement:
     possible: bool = True
 
 
-class Effect(ABC):
-    """One effect: what it measures of a scene, and what it builds where it is on.
+@dataclass(frozen=True)
+class Effect:
+    """One effect.
 
     Attributes:
-        name: on the command line, `--pipeline.effects.NAME`.
-        help: one line: what it is.
-        source: what it is measured on; with "photos" it is decided before stage 1, and stage 2 takes it over.
-        layout: whether it is one of the ways to lay space out, of which exactly one is on.
+        name: as on the command line, `--pipeline.effects.NAME`, and in `EffectSettings`.
+        measure: measures a scene. Before there is what it measures (a coarse field, a painting), `on` is an assumption.
+        source: what is measured. Effects of the photos are decided before stage 1, and stage 2 takes them over.
+        layout: whether it is a way to lay out space, of which exactly one is on.
     """
 
-    name: ClassVar[str]
-    help: ClassVar[str]
-    source: ClassVar[Source] = "photos"
-    layout: ClassVar[bool] = False
-
-    @abstractmethod
-    def measure(self, scene: Scene) -> Measurement:
-        """Measures a scene. Where what it is measured on isn't there yet, `on` is what is assumed until then."""
-
-    def build(self, parameters: Dict[str, List[float]], **needs: Any) -> Any:
-        """Makes the effect's module or value, called only where it is on; True for one that is a mere switch.
-
-        Args:
-            parameters: what `measure` found.
-            needs: what the effect asks of the place where it is built.
-        """
-        return True
+    name: str
+    measure: Callable[[Scene], Measurement]
+    source: Source = "photos"
+    layout: bool = False
 
 
 @dataclass(frozen=True)
@@ -100,42 +114,17 @@ COLUMNS = ("effect", "is", "measured", "threshold", "why")
 
 @dataclass(frozen=True)
 class Decisions:
-    """What is simulated. Made by `decide` alone; everything else receives it."""
+    """What is simulated, one decision for each effect. `registry.decide` makes it."""
 
     items: Tuple[Decision, ...]
 
     def __getitem__(self, name: str) -> Decision:
-        """The decision about an effect; off where a run is older than the effect."""
-        unknown = Decision(name, False, None, None, "not known yet when this was decided")
-        return next((item for item in self.items if item.name == name), unknown)
+        """The decision about an effect."""
+        return {item.name: item for item in self.items}[name]
 
     def on(self, name: str) -> bool:
         """Whether an effect is simulated."""
         return self[name].on
-
-    def on_photos(self) -> Dict[str, bool]:
-        """Whether effects are on that photos alone decide, so that a coarse run and a stylised one must agree."""
-        from sparsestyle_ns.effects.registry import EFFECTS
-
-        return {item.name: item.on for item in self.items if EFFECTS[item.name].source == "photos"}
-
-    def build(self, name: str, **needs: Any) -> Any:
-        """What an effect builds; None where it is off. See `Effect.build`."""
-        from sparsestyle_ns.effects.registry import EFFECTS
-
-        decision = self[name]
-        return EFFECTS[name].build(decision.parameters, **needs) if decision.on else None
-
-    def build_space(self, **needs: Any) -> Any:
-        """The space (`rendering.space.Space`) of the one layout that is on."""
-        return self.build(self.layout, **needs)
-
-    @property
-    def layout(self) -> str:
-        """The name of the effect that lays space out."""
-        from sparsestyle_ns.effects.registry import EFFECTS
-
-        return next(item.name for item in self.items if item.on and EFFECTS[item.name].layout)
 
     def replaced(self, decision: Decision) -> "Decisions":
         """The same decisions but one."""
@@ -175,11 +164,15 @@ class Decisions:
             "  ".join([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[-1]]) for row in rows
         )
 
-    def check_choices(self, settings: Any, whose: str) -> None:
-        """Makes sure that settings don't ask for something else than was decided.
+    def check_choices(self, settings: EffectSettings, whose: str) -> None:
+        """Makes sure that the command line doesn't contradict what was decided before.
+
+        Args:
+            settings: from the command line.
+            whose: where the decisions are from, in words.
 
         Raises:
-            InputError: they do.
+            InputError: it does.
         """
         for item in self.items:
             choice = getattr(settings, item.name)

@@ -1,10 +1,10 @@
-"""Sampling and marching that pass over what is empty."""
+"""Empty-space skipping: stage 1 puts its samples where something is, stage 2 skips the rest."""
 
-from typing import Any, Dict, List, Tuple
+from typing import Tuple
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from sparsestyle_ns.effects.base import Effect, Measurement
 from sparsestyle_ns.effects.scene import Scene
@@ -16,17 +16,17 @@ CELLS = 64
 MIN_ALPHA = 0.03
 """Opacity over a cell's side below which a point is empty."""
 MAX_MIST = 0.2
-"""Optical depth that such points may have all along the cube's side. Many cells that are empty one by one can hide what
-is behind them together; drafts of fern and lego have 0.05 and 0.01."""
+"""Optical depth that such points may have all along the cube's side. Many cells that are nearly empty can together hide
+what is behind them; drafts of fern and lego have 0.05 and 0.01."""
 NUM_POINTS = 1 << 14
-"""Points, always the same, at which a field is asked."""
+"""Points, always the same, at which the density is looked up."""
 
 
 @torch.no_grad()
 def opacities(scene: Scene) -> Tuple[Float[Tensor, "points"], Bool[Tensor, "points"]]:
     """1 − exp(−σ · cell side) of the coarse field at `NUM_POINTS` points of the cube, and which of them are empty.
 
-    None are in a mist: where all that could be passed over would be seen together.
+    None count as empty in a mist: where skipping all of them would be visible.
     """
     points = 2.0 * torch.rand(NUM_POINTS, 3, generator=torch.Generator().manual_seed(0)) - 1.0
     depths = scene.coarse_density(points).float().cpu() * (2.0 / CELLS)
@@ -36,20 +36,12 @@ def opacities(scene: Scene) -> Tuple[Float[Tensor, "points"], Bool[Tensor, "poin
     return alpha, empty & (mist <= MAX_MIST)
 
 
-class EmptySpace(Effect):
-    """Grids that remember where something is: stage 1 puts its samples there, stage 2 skips the rest."""
+def measure_empty_space(scene: Scene) -> Measurement:
+    """The share of space in which the coarse field is all but transparent."""
+    if scene.coarse_density is None:
+        return Measurement(True, "assumed until there is a coarse field to measure", None, MIN_EMPTY)
+    empty = float(opacities(scene)[1].float().mean())
+    return Measurement(empty >= MIN_EMPTY, "of space is empty", empty, MIN_EMPTY)
 
-    name = "empty_space"
-    help = "Empty-space skipping: enough of space is empty; decided again while stage 1 trains."
-    source = "coarse field"
 
-    def measure(self, scene: Scene) -> Measurement:
-        """See `Effect.measure`; the share of space in which the coarse field is all but transparent."""
-        if scene.coarse_density is None:
-            return Measurement(True, "assumed until there is a coarse field to measure", None, MIN_EMPTY)
-        empty = float(opacities(scene)[1].float().mean())
-        return Measurement(empty >= MIN_EMPTY, "of space is empty", empty, MIN_EMPTY)
-
-    def build(self, parameters: Dict[str, List[float]], **needs: Any) -> nn.Module:
-        """See `Effect.build`; the kind of `grid` that is asked for, with its `resolution`."""
-        return needs["grid"](needs["resolution"])
+EMPTY_SPACE = Effect("empty_space", measure_empty_space, source="coarse field")

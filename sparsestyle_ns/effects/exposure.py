@@ -1,6 +1,6 @@
 """Photos that differ by a gain: exposure and white balance, three numbers a photo."""
 
-from typing import Any, Dict, List, Optional, Tuple
+from typing import Optional, Tuple
 
 import numpy as np
 import torch
@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from sparsestyle_ns.data.matches import PointMatches, why_unmatched
-from sparsestyle_ns.effects.base import Effect, Measurement
+from sparsestyle_ns.effects.base import Decisions, Effect, Measurement
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_STOPS = 0.1
@@ -89,22 +89,20 @@ class ExposureCorrection(nn.Module):
         return ((colors - behind) / self.gains()[photo] + behind).clamp(0.0, 1.0)
 
 
-class Exposure(Effect):
-    """One gain for each photo and channel, learned with the field."""
+def build_exposure(effects: Decisions, num_photos: int) -> Optional[ExposureCorrection]:
+    """The photos' gains, to be learned with the field; None where the effect is off."""
+    return ExposureCorrection(num_photos) if effects.on("exposure") else None
 
-    name = "exposure"
-    help = "Exposure and white balance of each photo: photos differ by a gain."
 
-    def measure(self, scene: Scene) -> Measurement:
-        """See `Effect.measure`; the largest gain of a photo against the mean, in stops, from matched points."""
-        unknown = not_measurable(scene)
-        if unknown:
-            return Measurement(False, unknown, None, MIN_STOPS)
-        gains, _ = fit_gains(scene.matches)
-        stops = float(np.abs(gains).max() / np.log(2.0))
-        words = f"stops at most between a photo and the mean, by {len(scene.matches)} matched points"
-        return Measurement(stops >= MIN_STOPS, words, stops, MIN_STOPS)
+def measure_exposure(scene: Scene) -> Measurement:
+    """The largest gain of a photo against the mean, in stops, from matched points."""
+    unknown = not_measurable(scene)
+    if unknown:
+        return Measurement(False, unknown, None, MIN_STOPS)
+    gains, _ = fit_gains(scene.matches)
+    stops = float(np.abs(gains).max() / np.log(2.0))
+    words = f"stops at most between a photo and the mean, by {len(scene.matches)} matched points"
+    return Measurement(stops >= MIN_STOPS, words, stops, MIN_STOPS)
 
-    def build(self, parameters: Dict[str, List[float]], **needs: Any) -> ExposureCorrection:
-        """See `Effect.build`; needs the number of photos."""
-        return ExposureCorrection(needs["num_photos"])
+
+EXPOSURE = Effect("exposure", measure_exposure)

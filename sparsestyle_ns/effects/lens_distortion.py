@@ -1,18 +1,14 @@
-"""Rays of lenses that bend straight lines."""
-
-from typing import Any, Dict, List, Optional
+"""Lenses that bend straight lines: nerfstudio bends the rays by the cameras' distortion parameters."""
 
 import numpy as np
-from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
-from torch import Tensor
 
 from sparsestyle_ns.data.matches import undistorted
 from sparsestyle_ns.effects.base import Effect, Measurement
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_PIXELS = 0.25
-"""Shift of a photo's pixel by the lens from which on it matters."""
+"""Shift of a pixel by the lens, in pixels of the photos as they are, from which on it matters."""
 
 
 def largest_shift(cameras: Cameras) -> float:
@@ -33,22 +29,14 @@ def largest_shift(cameras: Cameras) -> float:
     return shift
 
 
-class LensDistortion(Effect):
-    """The cameras' distortion parameters, by which nerfstudio bends their rays."""
+def measure_lens_distortion(scene: Scene) -> Measurement:
+    """The largest shift of a pixel, in pixels of the photos as they are."""
+    if scene.cameras.distortion_params is None:
+        return Measurement(False, "the cameras have no distortion parameters", 0.0, MIN_PIXELS, possible=False)
+    if (scene.cameras.camera_type == CameraType.FISHEYE624.value).any():
+        return Measurement(True, "rays of FISHEYE624 cameras need their distortion parameters", None, MIN_PIXELS)
+    shift = largest_shift(scene.cameras)
+    return Measurement(shift >= MIN_PIXELS, "pixels at most by which the lens moves a point", shift, MIN_PIXELS)
 
-    name = "lens_distortion"
-    help = "Lens distortion: the cameras' parameters move pixels."
 
-    def measure(self, scene: Scene) -> Measurement:
-        """See `Effect.measure`; the largest shift of a pixel, in pixels of the photos as they are."""
-        if scene.cameras.distortion_params is None:
-            words = "the cameras have no distortion parameters"
-            return Measurement(False, words, 0.0, MIN_PIXELS, possible=False)
-        if (scene.cameras.camera_type == CameraType.FISHEYE624.value).any():
-            return Measurement(True, "such cameras' rays are made of their distortion parameters", None, MIN_PIXELS)
-        shift = largest_shift(scene.cameras)
-        return Measurement(shift >= MIN_PIXELS, "pixels at most by which the lens moves a point", shift, MIN_PIXELS)
-
-    def build(self, parameters: Dict[str, List[float]], **needs: Any) -> Optional[Float[Tensor, "views 6"]]:
-        """See `Effect.build`; the distortion parameters of some cameras."""
-        return needs["cameras"].distortion_params
+LENS_DISTORTION = Effect("lens_distortion", measure_lens_distortion)

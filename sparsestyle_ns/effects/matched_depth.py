@@ -1,7 +1,10 @@
-"""The depth of points that two photos share, which a coarse field of few photos can't be sure of by colours alone."""
+"""The depth of points that two photos share: colours of few photos alone don't settle it.
+
+Stage 1 learns that rays to such points end there (DS-NeRF's idea, Deng et al. 2022, without COLMAP).
+"""
 
 from dataclasses import dataclass
-from typing import Any, Dict, List, Tuple
+from typing import Optional, Tuple
 
 import numpy as np
 import torch
@@ -9,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestyle_ns.data.matches import distances_along, why_unmatched
-from sparsestyle_ns.effects.base import Effect, Measurement
+from sparsestyle_ns.effects.base import Decisions, Effect, Measurement
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_POINTS = 100
@@ -35,12 +38,12 @@ class MatchedRays:
         return len(self.origins)
 
 
-def matched_rays(scene: Scene) -> MatchedRays:
+def triangulate(scene: Scene) -> MatchedRays:
     """Two rays for each point that two photos share and that lies in front of both, one from each camera.
 
     Points are where the two rays come nearest to each other.
     """
-    matches, poses = scene.matches, scene.camera_to_worlds
+    matches, poses = scene.matches, scene.cameras.camera_to_worlds.double().numpy()
     photos = np.array(scene.matched_views, dtype=int)
     views = photos[matches.first], photos[matches.second]
     origins = poses[views[0], :, 3], poses[views[1], :, 3]
@@ -56,21 +59,19 @@ def matched_rays(scene: Scene) -> MatchedRays:
     )
 
 
-class MatchedDepth(Effect):
-    """Stage 1 sees to it that rays to matched points end there (DS-NeRF's idea, Deng et al. 2022, without COLMAP)."""
+def measure_matched_depth(scene: Scene) -> Measurement:
+    """How many points of a photo, on average, are matched and triangulated."""
+    unmatched = why_unmatched(scene.cameras)
+    if unmatched:
+        return Measurement(False, f"not measurable: {unmatched}", None, float(MIN_POINTS), possible=False)
+    count = len(triangulate(scene)) / max(1, len(scene.matched_views))
+    words = "points a photo, on average, have a depth known from another photo"
+    return Measurement(count >= MIN_POINTS, words, count, float(MIN_POINTS), possible=count > 0)
 
-    name = "matched_depth"
-    help = "Depth of points that two photos share, from matching."
 
-    def measure(self, scene: Scene) -> Measurement:
-        """See `Effect.measure`; how many points of a photo, on average, are matched and triangulated."""
-        unmatched = why_unmatched(scene.cameras)
-        if unmatched:
-            return Measurement(False, f"not measurable: {unmatched}", None, float(MIN_POINTS), possible=False)
-        count = len(matched_rays(scene)) / max(1, len(scene.matched_views))
-        words = "points of a photo are seen by another, so that their depth is known"
-        return Measurement(count >= MIN_POINTS, words, count, float(MIN_POINTS), possible=count > 0)
+MATCHED_DEPTH = Effect("matched_depth", measure_matched_depth)
 
-    def build(self, parameters: Dict[str, List[float]], **needs: Any) -> MatchedRays:
-        """See `Effect.build`; needs the scene."""
-        return matched_rays(needs["scene"])
+
+def matched_rays(effects: Decisions, scene: Scene) -> Optional[MatchedRays]:
+    """Rays whose depth stage 1 learns beside the photos' colours; None where the effect is off."""
+    return triangulate(scene) if effects.on("matched_depth") else None

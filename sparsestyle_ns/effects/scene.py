@@ -1,12 +1,12 @@
 """What effects are measured on: the training photos and their cameras, and later the coarse field and the painting.
 
-Nothing is read or computed before an effect asks for it, and nothing twice.
+Everything is read and computed at most once, and only when an effect asks for it.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Optional, Tuple
+from typing import Callable, List, Optional
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from sparsestyle_ns.data.matches import PointMatches, match_points
 from sparsestyle_ns.data.photos import open_photo
+from sparsestyle_ns.data.scene_info import NDC, scene_info
 from sparsestyle_ns.data.view_selection import evenly_spaced
 
 LONGEST_SIDE = 504
@@ -37,8 +38,8 @@ class Scene:
     Attributes:
         filenames: the photos.
         cameras: their cameras.
-        scene_box: [2, 3], the dataparser's box.
-        metadata: the dataparser's.
+        scene_box: lower and upper corner of the dataparser's box.
+        ndc: the dataparser's map to NDC, in which the box then is; None where it gives none.
         alpha_color: RGB that it puts behind transparent photos; None where it doesn't.
         coarse_density: σ_c at field coordinates, once there is a coarse field.
         style_image: the painting, once it is known.
@@ -47,7 +48,7 @@ class Scene:
     filenames: List[Path]
     cameras: Cameras
     scene_box: Float[Tensor, "2 3"]
-    metadata: Dict[str, Any]
+    ndc: Optional[NDC] = None
     alpha_color: Optional[Float[Tensor, "3"]] = None
     coarse_density: Optional[Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]] = None
     style_image: Optional[Float[Tensor, "3 H W"]] = None
@@ -59,7 +60,7 @@ class Scene:
             filenames=list(outputs.image_filenames),
             cameras=outputs.cameras,
             scene_box=outputs.scene_box.aabb,
-            metadata=outputs.metadata,
+            ndc=scene_info(outputs).ndc,
             alpha_color=outputs.alpha_color,
         )
 
@@ -67,16 +68,6 @@ class Scene:
     def num_views(self) -> int:
         """Training views."""
         return len(self.filenames)
-
-    @property
-    def camera_to_worlds(self) -> Float[np.ndarray, "views 3 4"]:
-        """The cameras' poses."""
-        return self.cameras.camera_to_worlds.double().numpy()
-
-    @property
-    def box(self) -> Tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner of the scene box."""
-        return tuple(self.scene_box.double().numpy())
 
     @cached_property
     def photos(self) -> List[Float[np.ndarray, "H W 4"]]:

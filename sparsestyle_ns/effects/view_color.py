@@ -1,6 +1,4 @@
-"""Colour that depends on where it is seen from."""
-
-from typing import Any, Dict, List
+"""Colour that depends on the view direction: the coarse field's colour head sees it, as in Eq. 1."""
 
 import numpy as np
 
@@ -16,27 +14,20 @@ MIN_SHARE = 0.08
 """Share of matched points that differ by more, from which on colour depends on the view."""
 
 
-class ViewColor(Effect):
-    """The coarse field's colour head sees the view direction, as in Eq. 1."""
+def measure_view_color(scene: Scene) -> Measurement:
+    """The share of matched points whose colours differ by more than `NOISE`, exposure taken off."""
+    matches, unknown = scene.matches, not_measurable(scene)
+    if unknown:
+        return Measurement(False, unknown, None, MIN_SHARE)
+    _, unexplained = fit_gains(matches)
+    # A log ratio r of two colours with the mean m is a difference of about r m.
+    differences = np.abs(unexplained) * (0.5 * (matches.colors_first + matches.colors_second) + DARK)
+    share = float((differences.mean(axis=-1) > NOISE).mean())
+    words, on = f"of {len(matches)} matched points change colour with the view", share >= MIN_SHARE
+    if on and scene.num_views < MIN_VIEWS:
+        words += f", but {scene.num_views} photos are too few to tell shine from shape; {MIN_VIEWS} are needed"
+        on = False
+    return Measurement(on, words, share, MIN_SHARE)
 
-    name = "view_color"
-    help = "View-dependent colour: the same point differs between photos beyond noise and exposure."
 
-    def measure(self, scene: Scene) -> Measurement:
-        """See `Effect.measure`; the share of matched points that differ by more than `NOISE`, exposure taken off."""
-        matches, unknown = scene.matches, not_measurable(scene)
-        if unknown:
-            return Measurement(False, unknown, None, MIN_SHARE)
-        _, unexplained = fit_gains(matches)
-        # A log ratio r of two colours with the mean m is a difference of about r m.
-        differences = np.abs(unexplained) * (0.5 * (matches.colors_first + matches.colors_second) + DARK)
-        share = float((differences.mean(axis=-1) > NOISE).mean())
-        words = f"of {len(matches)} matched points change colour with the view"
-        if share >= MIN_SHARE and scene.num_views < MIN_VIEWS:
-            words += f", but {scene.num_views} photos can't tell shine from shape; {MIN_VIEWS} can"
-            return Measurement(False, words, share, MIN_SHARE)
-        return Measurement(share >= MIN_SHARE, words, share, MIN_SHARE)
-
-    def build(self, parameters: Dict[str, List[float]], **needs: Any) -> int:
-        """See `Effect.build`; the octaves of the direction's encoding, as the model's settings have them."""
-        return needs["direction_levels"]
+VIEW_COLOR = Effect("view_color", measure_view_color)

@@ -6,7 +6,7 @@ from typing import Any, Dict, List, Optional, Tuple, Type
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -19,38 +19,14 @@ from sparsestyle_ns.core.volrend import distortion, effective_samples
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.field_components.positional_encoding import revealed_levels
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
-from sparsestyle_ns.fields.coarse import CoarseField, DensityActivation
+from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.losses.geometry import matched_depth_loss, near_density
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.metrics.image import image_metrics
-from sparsestyle_ns.rendering.render import DenseRender, render_coarse, seen_behind
+from sparsestyle_ns.models.scene_model import SceneModel
+from sparsestyle_ns.rendering.render import DenseRender, render_coarse, seen_behind, surface_distance
 from sparsestyle_ns.utils.distributed import gather_rays, num_processes, shard_rays
 from sparsestyle_ns.utils.errors import InputError
-
-
-@dataclass
-class CoarseFieldConfig:
-    """The shape of the coarse field."""
-
-    num_levels: int = 7
-    """Octaves of the positional encoding of x."""
-    num_layers: int = 6
-    """Hidden layers."""
-    layer_width: int = 256
-    """Units in a hidden layer."""
-    feature_dim: int = 64
-    """Length of the geometric feature e_c."""
-    direction_levels: int = 4
-    """Octaves of the view direction's encoding, where colour depends on it (`--pipeline.effects.view-color`)."""
-    density_activation: DensityActivation = "exp"
-    """What keeps the density positive. exp finds surfaces sooner than softplus (README, Where the paper is silent)."""
-    density_bias: float = 1.0
-    """Added to the density's logit: a field that starts as dense fog is less drawn to the far end of its rays."""
-
-    def setup(self, effects: Decisions) -> CoarseField:
-        """The field, for what was decided about the scene."""
-        levels = effects.build("view_color", direction_levels=self.direction_levels)
-        return CoarseField(**(vars(self) | {"direction_levels": levels}))
 
 
 @dataclass
@@ -98,31 +74,27 @@ class CoarseFewShotModelConfig(ModelConfig):
     """Seed of the jitter of samples; a step's jitter depends on it and the step alone."""
 
 
-class CoarseFewShotModel(Model):
+class CoarseFewShotModel(SceneModel):
     """The coarse field, trained on the reconstruction loss (Eq. 4) with regularisers that make it a surface."""
 
     config: CoarseFewShotModelConfig
 
     def populate_modules(self) -> None:
-        """Builds the field, the space, and what the scene's effects need."""
+        """Builds the field, and the grid that guides samples."""
         super().populate_modules()
         if not 0.0 < self.config.even_share <= 1.0:
             share = self.config.even_share
             raise InputError(f"--pipeline.model.even-share is {share}; give a number above 0 and up to 1.")
-        metadata: Dict[str, Any] = self.kwargs["metadata"]
-        effects: Decisions = metadata["effects"]
-        self.space = effects.build_space(scene_box=self.scene_box, metadata=metadata)
-        self.field = self.config.coarse_field.setup(effects)
-        self.build_grid(effects)
-        self.exposure = effects.build("exposure", num_photos=self.num_train_data)
-        self.register_buffer("background", effects.build("background"), persistent=False)
+        self.field = self.config.coarse_field.setup(self.effects.on("view_color"))
+        self.build_grid(self.effects)
         self.step = 0
         self.num_steps = 1
 
     def build_grid(self, effects: Decisions) -> None:
         """Makes the grid that guides samples, or takes it away, as is decided; a new one knows nothing yet."""
-        grid = effects.build("empty_space", grid=DensityGrid, resolution=self.config.grid_resolution)
-        self.grid = None if grid is None else grid.to(next(self.field.parameters()).device)
+        self.grid = None
+        if effects.on("empty_space"):
+            self.grid = DensityGrid(self.config.grid_resolution).to(next(self.field.parameters()).device)
 
     def get_param_groups(self) -> Dict[str, List[Parameter]]:
         """One group, `fields`: the field, and the photos' exposures where they are learned."""
@@ -194,7 +166,7 @@ class CoarseFewShotModel(Model):
         """`rgb`, `accumulation`, and `depth` in world units; in training also what the losses need."""
         if not self.training:
             render, segments = self.render_rays(ray_bundle, self.config.num_eval_samples)
-            depth = segments.distance(render.s.clamp(max=1.0 - 1e-4))
+            depth = surface_distance(segments, render.s)
             return {"rgb": render.rgb, "accumulation": render.accumulation, "depth": depth}
         segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
         render, edges = self.render_batch(segments, ray_bundle.origins, ray_bundle.directions)

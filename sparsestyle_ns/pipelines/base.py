@@ -2,24 +2,26 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Dict, Literal, Optional, Union
+from typing import Annotated, Any, Callable, Dict, Literal, Optional, Union
 
 import torch
 import tyro
 from nerfstudio.data.datamanagers.base_datamanager import DataManagerConfig
-from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.pipelines.base_pipeline import Pipeline, VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from torch.amp import GradScaler
 
-from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings
+from sparsestyle_ns.data.scene_info import scene_info
+from sparsestyle_ns.effects.base import Decisions, EffectSettings
+from sparsestyle_ns.effects.registry import decide
+from sparsestyle_ns.evaluation.held_out import HeldOutReport, evaluate_held_out
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, FewShotDataManagerConfig
-from sparsestyle_ns.style.vgg import VGGFeatures, load_backbone
+from sparsestyle_ns.style.backbone import Backbone
+from sparsestyle_ns.style.backbones import BackboneChoice, load_backbone
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.ffmpeg import put_ffmpeg_on_path
-from sparsestyle_ns.viewer.effects_panel import EffectsPanel
 
 TestMode = Literal["test", "val", "inference"]
 
@@ -30,19 +32,19 @@ class CheckedPipelineConfig(VanillaPipelineConfig):
 
     datamanager: DataManagerConfig = field(default_factory=FewShotDataManagerConfig)
     """The photos."""
-    effects: EffectSettings = ALL_AUTO
+    effects: EffectSettings = field(default_factory=EffectSettings)
     """Which effects are simulated; auto measures whether the scene calls for them."""
     decided: tyro.conf.Suppress[Optional[Decisions]] = None
     """What was decided, with its reasons; a loaded run has it and measures nothing."""
     vgg_weights: Annotated[Optional[Path], tyro.conf.arg(aliases=("--vgg-weights",))] = None
     """File with the weights of VGG-16. None: torchvision's, where they are cached or can be downloaded, else those in
     the package stlpips-pytorch."""
-    backbone: Annotated[Literal["auto", "vgg16", "vgg16-shift-tolerant"], tyro.conf.arg(aliases=("--backbone",))] = (
-        "auto"
-    )
-    """Feature network; auto takes whichever of the two has weights."""
+    backbone: Annotated[BackboneChoice, tyro.conf.arg(aliases=("--backbone",))] = "auto"
+    """Feature network; auto takes the first that has weights."""
+    panel: tyro.conf.Suppress[Optional[Callable[["CheckedPipeline"], Union[ViewerElement, ViewerControl]]]] = None
+    """Makes what the viewer shows of a run beside nerfstudio's own controls; None: nothing."""
 
-    def load_backbone(self, device: torch.device) -> VGGFeatures:
+    def load_backbone(self, device: torch.device) -> Backbone:
         """The feature network of these settings.
 
         Raises:
@@ -54,7 +56,8 @@ class CheckedPipelineConfig(VanillaPipelineConfig):
 class CheckedPipeline(VanillaPipeline):
     """A pipeline that ends with a clear sentence on bad input, and never loads a checkpoint in part.
 
-    It receives what was decided about the scene's effects, or has it decided, and keeps it in its config.
+    It decides which of the scene's effects are simulated, unless its config says so already, and tells the data manager
+    and the model. `config.decided` is the one thing that it writes into its config: a saved run is opened by it.
     """
 
     config: CheckedPipelineConfig
@@ -70,19 +73,26 @@ class CheckedPipeline(VanillaPipeline):
         local_rank: int = 0,
         grad_scaler: Optional[GradScaler] = None,
     ) -> None:
-        config.datamanager.effects, config.datamanager.decided = config.effects, config.decided
-        # However many processes there are, the model is not to be wrapped (see `processes`).
-        super().__init__(config, device, test_mode, 1, local_rank, grad_scaler)
-        config.decided = self.datamanager.effects
-        config.datamanager.decided = None
+        Pipeline.__init__(self)  # VanillaPipeline's would build the model without what is decided
+        self.config, self.test_mode = config, test_mode
+        self.world_size = 1  # however many processes there are, the model is not to be wrapped (see `distributed`)
+        self.datamanager = config.datamanager.setup(device=device, test_mode=test_mode, local_rank=local_rank)
+        self.datamanager.to(device)
+        if config.decided is None:
+            config.decided = decide(self.datamanager.scene, config.effects)
+        self.datamanager.set_effects(config.decided)
+        dataset = self.datamanager.train_dataset
+        self._model = config.model.setup(
+            scene_box=dataset.scene_box,
+            num_train_data=len(dataset),
+            effects=config.decided,
+            ndc=scene_info(self.datamanager.train_dataparser_outputs).ndc,
+            device=device,
+        ).to(device)
         CONSOLE.print("Effects:", self.effects.text(), sep="\n", soft_wrap=True, highlight=False)
-        self.panel = self.make_panel()
+        self.panel = None if config.panel is None else config.panel(self)  # nerfstudio's viewer finds it here
         if test_mode != "val":
             put_ffmpeg_on_path()
-
-    def make_panel(self) -> Union[ViewerElement, ViewerControl]:
-        """What the viewer shows of this run beside nerfstudio's own controls."""
-        return EffectsPanel(lambda: self.effects.markdown())
 
     @property
     def effects(self) -> Decisions:
@@ -90,24 +100,34 @@ class CheckedPipeline(VanillaPipeline):
         assert self.config.decided is not None
         return self.config.decided
 
-    def announce(self, backbone: VGGFeatures) -> None:
+    def announce(self, backbone: Backbone) -> None:
         """Says which feature network is in use, and where its weights came from."""
         description = backbone.description
         CONSOLE.print(f"Features: {description.name}, {description.source}", soft_wrap=True)
 
-    def painting(self) -> Optional[StyleTargets]:
-        """The painting to measure against, where the method has one and it is still there."""
+    def style_targets(self, style_image: Optional[Path] = None) -> Optional[StyleTargets]:
+        """The painting to measure against, where the method has one and it is still there.
+
+        Args:
+            style_image: another one than that of the run.
+        """
         return None
+
+    def held_out_report(
+        self, style_image: Optional[Path] = None, baked: bool = False, picture_folder: Optional[Path] = None
+    ) -> HeldOutReport:
+        """What `sparsestyle evaluate` measures; see `evaluate_held_out`."""
+        views, cameras = self.datamanager.eval_dataset, self.datamanager.train_dataset.cameras
+        targets = self.style_targets(style_image)
+        return evaluate_held_out(self.model, views, cameras, targets, baked, picture_folder)
 
     @exit_on_input_error
     def get_average_eval_image_metrics(
         self, step: Optional[int] = None, output_path: Optional[Path] = None, get_std: bool = False
     ) -> Dict[str, float]:
         """The figures of `sparsestyle evaluate`, for `ns-eval`, with the time that rendering took."""
-        from sparsestyle_ns.evaluation.held_out import evaluate_held_out
-
         self.eval()
-        report = evaluate_held_out(self, self.painting(), picture_folder=output_path)
+        report = self.held_out_report(picture_folder=output_path)
         self.train()
         return {**report.means, **(report.deviations() if get_std else {}), **report.speed()}
 

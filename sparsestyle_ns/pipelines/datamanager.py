@@ -1,30 +1,33 @@
 """Photos and rays for training on a few views, whatever nerfstudio dataparser reads them."""
 
-import copy
 import functools
 import math
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Dict, Optional, Tuple, Type, Union
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Dict, Literal, Optional, Tuple, Type, Union
 
 import torch
 import tyro
 from jaxtyping import Float, Int
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
-from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
-from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.datamanagers.base_datamanager import (
+    DataManager,
+    VanillaDataManager,
+    VanillaDataManagerConfig,
+    variable_res_collate,
+)
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.utils.dataloaders import RandIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from sparsestyle_ns.data.photos import SMALLEST_SIDE, PhotoDataset, at_size, check_one_size, open_photo
-from sparsestyle_ns.data.transforms import read_transforms
-from sparsestyle_ns.data.view_selection import BLENDER_VIEWS, DEFAULT_NUM_VIEWS, select_views
+from sparsestyle_ns.data.photos import SMALLEST_SIDE, PhotoDataset, at_size, check_one_size
+from sparsestyle_ns.data.reading import read_scene
+from sparsestyle_ns.data.scene_info import scene_info, select_outputs
+from sparsestyle_ns.data.view_selection import select_views
 from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.effects.matched_depth import MatchedRays
-from sparsestyle_ns.effects.registry import ALL_AUTO, EffectSettings, decide
+from sparsestyle_ns.effects.matched_depth import MatchedRays, matched_rays
 from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.utils.distributed import num_processes
 from sparsestyle_ns.utils.errors import InputError
@@ -47,10 +50,6 @@ class FewShotDataManagerConfig(VanillaDataManagerConfig):
     """Rays to matched points in a batch, over its other rays; none where `matched_depth` is off (see Effects)."""
     seed: int = 42
     """Seed of the choice of pixels; a step's batch depends on it and the step alone, so a resumed run sees the same."""
-    effects: tyro.conf.Suppress[EffectSettings] = ALL_AUTO
-    """The pipeline's, which hands them on."""
-    decided: tyro.conf.Suppress[Optional[Decisions]] = None
-    """What was decided before; None: the scene is measured."""
 
 
 @dataclass
@@ -78,46 +77,53 @@ class TrainingPixels:
 class FewShotDataManager(VanillaDataManager[PhotoDataset]):
     """Keeps the few training views, and all their rays, in memory.
 
-    It chooses the views (`select_views`), reduces large photos, has the effects decided, and adds to the datasets'
-    metadata what the models need to know of the scene: `effects` and `view_ids`.
+    It chooses the views (`select_views`) and reduces large photos. The pipeline tells it by `set_effects` what was
+    decided about the scene; photos and rays are loaded after that.
+
+    Attributes:
+        train_dataparser_outputs: the views to train on, with their `SceneInfo`.
+        train_dataset, eval_dataset: their photos, and those of the held-out views.
+        pixels: the photos' pixels with their rays, once they are loaded.
+
+    Raises:
+        InputError: the scene or a setting can't be used.
     """
 
     config: FewShotDataManagerConfig
-    effects: Decisions
+    effects: Optional[Decisions] = None
+    pixels: TrainingPixels
 
-    @property
-    def dataparser(self) -> DataParser:
-        """nerfstudio's reader of the scene."""
-        return self._dataparser
-
-    @dataparser.setter
-    def dataparser(self, parser: DataParser) -> None:
-        parser.get_dataparser_outputs = functools.partial(read_scene, parser)
-        self._dataparser = parser
-
-    def create_train_dataset(self) -> PhotoDataset:
-        """The dataset of the selected views only."""
+    def __init__(
+        self,
+        config: FewShotDataManagerConfig,
+        device: Union[torch.device, str] = "cpu",
+        test_mode: Literal["test", "val", "inference"] = "val",
+        world_size: int = 1,
+        local_rank: int = 0,
+    ) -> None:
+        # Not VanillaDataManager's, which reads the scene unchecked.
+        self.config, self.device, self.test_mode = config, device, test_mode
+        self.world_size, self.local_rank, self.sampler = world_size, local_rank, None
         self._check_settings()
-        outputs = self.train_dataparser_outputs
-        ids = outputs.metadata.get("view_ids", list(range(len(outputs.image_filenames))))
-        forward_facing = outputs.metadata.get("space") == "ndc"
-        standard = BLENDER_VIEWS if isinstance(self.config.dataparser, BlenderDataParserConfig) else None
-        default = DEFAULT_NUM_VIEWS["llff" if forward_facing else "other"]
-        if forward_facing and self.dataparser.config.eval_interval >= len(ids):
-            default = len(ids)
-        chosen = select_views(ids, self.config.num_views, self.config.view_ids, default, standard)
-        self.view_ids = tuple(ids[position] for position in chosen)
-        self.train_dataparser_outputs = select_outputs(outputs, chosen)
-        if len(outputs.cameras.width.unique()) == len(outputs.cameras.height.unique()) == 1:
-            # Blender's cameras have the size of the first photo, also where that isn't trained on.
-            check_one_size([outputs.image_filenames[0], *self.train_dataparser_outputs.image_filenames])
-        if self.test_mode == "val":
-            names = ", ".join(path.name for path in self.train_dataparser_outputs.image_filenames)
-            CONSOLE.print(
-                f"Training on {len(chosen)} of {len(ids)} views: {', '.join(map(str, self.view_ids))} ({names})."
-            )
-        self.effects = self.config.decided or decide(self.scene, self.config.effects)
-        return self._dataset(self.train_dataparser_outputs)
+        self.dataparser_config = config.dataparser
+        if config.data is None:
+            config.data = config.dataparser.data
+        config.dataparser.data = config.data = Path(config.data)
+        self.dataparser = config.dataparser.setup()
+        if test_mode == "inference":
+            self.dataparser.downscale_factor = 1  # as in nerfstudio, whose parser then opens no photo
+        self.includes_time = self.dataparser.includes_time
+        self.test_split = "val" if test_mode == "val" else "test"
+        self.train_dataparser_outputs = self._chosen_views()
+        self.train_dataset = self.create_train_dataset()
+        self.eval_dataset = self.create_eval_dataset()
+        self.exclude_batch_keys_from_device = self.train_dataset.exclude_batch_keys_from_device
+        if config.masks_on_gpu and "mask" in self.exclude_batch_keys_from_device:
+            self.exclude_batch_keys_from_device.remove("mask")
+        sizes = [self.train_dataset.cameras.width.unique(), self.train_dataset.cameras.height.unique()]
+        if any(len(each) > 1 for each in sizes):
+            config.collate_fn = variable_res_collate  # what nerfstudio does for photos of several sizes
+        DataManager.__init__(self)
 
     def _check_settings(self) -> None:
         side, rays = self.config.max_image_side, self.config.train_num_rays_per_batch
@@ -126,14 +132,30 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         if rays < 1:
             raise InputError(f"--pipeline.datamanager.train-num-rays-per-batch is {rays}; give 1 or more.")
 
-    @property
-    def scene(self) -> Scene:
-        """The training views, for measuring."""
-        return Scene.of(self.train_dataparser_outputs)
+    def _chosen_views(self) -> DataparserOutputs:
+        """The views to train on."""
+        outputs = read_scene(self.dataparser)
+        info, config = scene_info(outputs), self.config
+        chosen = select_views(
+            info.view_ids, config.num_views, config.view_ids, info.default_num_views, info.standard_views
+        )
+        selected = select_outputs(outputs, chosen)
+        if len(outputs.cameras.width.unique()) == len(outputs.cameras.height.unique()) == 1:
+            # Blender's cameras have the size of the first photo, also where that isn't trained on.
+            check_one_size([outputs.image_filenames[0], *selected.image_filenames])
+        if self.test_mode == "val":
+            names = ", ".join(path.name for path in selected.image_filenames)
+            ids = ", ".join(str(info.view_ids[position]) for position in chosen)
+            CONSOLE.print(f"Training on {len(chosen)} of {len(info.view_ids)} views: {ids} ({names}).")
+        return selected
+
+    def create_train_dataset(self) -> PhotoDataset:
+        """The dataset of the chosen views."""
+        return self._dataset(self.train_dataparser_outputs)
 
     def create_eval_dataset(self) -> PhotoDataset:
         """The dataparser's whole held-out split; the training views where it holds out none, as of very few photos."""
-        outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
+        outputs = read_scene(self.dataparser, self.test_split)
         if not outputs.image_filenames:
             CONSOLE.print("No view is held out; evaluating on the training views.")
             outputs = self.train_dataparser_outputs
@@ -146,20 +168,50 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         if limit is not None and longest * scale > limit:
             # A little more, as nerfstudio cuts sides off to whole pixels, photos' and masks' in different precision.
             scale = (1.0 + 1e-6) * limit / longest
-        dataset = self.dataset_type(dataparser_outputs=outputs, scale_factor=scale)
+        dataset = PhotoDataset(outputs, scale)
         dataset.cameras = at_size(outputs.cameras, dataset.cameras.width, dataset.cameras.height)
-        dataset.cameras.distortion_params = self.effects.build("lens_distortion", cameras=dataset.cameras)
-        dataset.metadata.update(effects=self.effects, view_ids=self.view_ids)
         return dataset
 
+    @property
+    def view_ids(self) -> Tuple[int, ...]:
+        """The ids of the views that are trained on."""
+        return scene_info(self.train_dataparser_outputs).view_ids
+
+    @property
+    def scene(self) -> Scene:
+        """The training views, for measuring."""
+        return Scene.of(self.train_dataparser_outputs)
+
+    def set_effects(self, effects: Decisions) -> None:
+        """Takes over what was decided, before photos are loaded: whether lenses bend rays, and whether depth is known.
+
+        Photos are loaded now, so that one that can't be used is found at once; for mere inference they aren't needed.
+        """
+        self.effects = effects
+        if not effects.on("lens_distortion"):
+            for dataset in (self.train_dataset, self.eval_dataset):
+                dataset.cameras.distortion_params = None
+        if self.test_mode != "inference":
+            self.load_pixels()
+
+    def load_pixels(self) -> None:
+        """Loads the training photos and generates all their rays, unless that is done already."""
+        if not hasattr(self, "pixels"):
+            self.pixels = gather_pixels(self.train_dataset, self.device)
+
+    @functools.cached_property
+    def matched(self) -> Optional[MatchedRays]:
+        """Rays to points of known depth; None where the effect is off. Found when training begins."""
+        rays = None if self.effects is None else matched_rays(self.effects, self.scene)
+        return None if rays is None else MatchedRays(**{key: part.to(self.device) for key, part in vars(rays).items()})
+
     def setup_train(self) -> None:
-        """Loads the photos and generates all their rays once."""
-        self.pixels = gather_pixels(self.train_dataset, self.device)
+        """Nothing yet: rays are generated once it is decided whether lenses bend them (`set_effects`)."""
 
     def setup_eval(self) -> None:
-        """Sees to it that held-out photos can be used.
+        """Makes sure that held-out photos can be used.
 
-        nerfstudio would keep all of them in memory, for batches of their pixels that few ask for (`next_eval`).
+        nerfstudio would keep all of them in memory, for batches of their pixels that are rarely needed (`next_eval`).
         """
         if self.test_mode == "val":
             for index in range(len(self.eval_dataset)):
@@ -171,12 +223,6 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         if not hasattr(self, "eval_image_dataloader"):
             super().setup_eval()
         return super().next_eval(step)
-
-    @functools.cached_property
-    def matched(self) -> Optional[MatchedRays]:
-        """Rays to points of known depth; None where the effect is off. Found when training begins."""
-        rays = self.effects.build("matched_depth", scene=self.scene)
-        return None if rays is None else MatchedRays(**{key: part.to(self.device) for key, part in vars(rays).items()})
 
     def next_train(self, step: int) -> Tuple[RayBundle, Dict[str, Any]]:
         """A batch of random pixels of all training views; the same for the same seed and step.
@@ -203,72 +249,6 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
     def get_train_rays_per_batch(self) -> int:
         """Rays of a batch that this process renders."""
         return self.config.train_num_rays_per_batch // num_processes()
-
-
-def read_scene(parser: DataParser, split: str = "train", **kwargs: Any) -> DataparserOutputs:
-    """What a dataparser says of one split of a scene, checked; nerfstudio's own parsers check next to nothing.
-
-    Raises:
-        InputError: the scene can't be read, or a camera in it is none.
-    """
-    config = parser.config
-    name = type(config).__name__.removesuffix("DataParserConfig").lower()
-    if isinstance(config, BlenderDataParserConfig):
-        frames = read_transforms(config.data / f"transforms_{split}.json", with_angle=True)["frames"]
-        first = frames[0]["file_path"].replace("./", "")
-        open_photo(config.data / f"{first}.png")  # gives all cameras of the split their size
-    elif isinstance(config, NerfstudioDataParserConfig):
-        is_file = config.data.suffix == ".json"
-        read_transforms(config.data if is_file else config.data / "transforms.json", with_angle=False)
-    try:
-        outputs = DataParser.get_dataparser_outputs(parser, split, **kwargs)
-    except InputError:
-        raise
-    except Exception as error:  # a file that isn't as a parser expects it shows itself in any kind of error
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(
-            f"{config.data} can't be read as a scene of the kind {name} ({type(error).__name__}: {reason}); correct "
-            "its files, or choose the dataparser that they were made for."
-        ) from error
-    check_cameras(outputs)
-    return outputs
-
-
-def check_cameras(outputs: DataparserOutputs) -> None:
-    """Makes sure that cameras are finite and have an angle of view.
-
-    Raises:
-        InputError: one isn't or hasn't; its photo is named.
-    """
-    cameras = outputs.cameras
-    if len(cameras) == 0:  # a split may be empty
-        return
-    numbers = [cameras.camera_to_worlds.flatten(1), cameras.fx, cameras.fy, cameras.cx, cameras.cy]
-    usable = torch.cat([part.reshape(len(cameras), -1) for part in numbers], dim=-1).isfinite().all(dim=-1)
-    for part in (cameras.fx, cameras.fy, cameras.width, cameras.height):
-        usable &= (part > 0).reshape(len(cameras), -1).all(dim=-1)
-    if not usable.all():
-        photo = outputs.image_filenames[int((~usable).nonzero()[0])]
-        raise InputError(
-            f"The camera of {photo} has a pose that is not finite, or a focal length or size that is not above 0: "
-            "correct it, or take the photo out of the scene."
-        )
-
-
-def select_outputs(outputs: DataparserOutputs, positions: Tuple[int, ...]) -> DataparserOutputs:
-    """The same scene with only the views at these positions."""
-    index = torch.tensor(positions)
-    metadata = copy.copy(outputs.metadata)
-    for key in ("view_ids", "view_names"):
-        if key in metadata:
-            metadata[key] = [metadata[key][position] for position in positions]
-    return replace(
-        outputs,
-        image_filenames=[outputs.image_filenames[position] for position in positions],
-        mask_filenames=outputs.mask_filenames and [outputs.mask_filenames[position] for position in positions],
-        cameras=outputs.cameras[index],
-        metadata=metadata,
-    )
 
 
 def gather_pixels(dataset: InputDataset, device: Union[str, torch.device]) -> TrainingPixels:

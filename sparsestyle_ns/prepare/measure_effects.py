@@ -4,20 +4,18 @@ import copy
 from pathlib import Path
 from typing import Optional, Tuple
 
-from nerfstudio.configs.dataparser_configs import all_dataparsers
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 
-from sparsestyle_ns.data.parser_choice import check_parser
-from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.effects.registry import ALL_AUTO, decide
+from sparsestyle_ns.effects.base import Decisions, EffectSettings
+from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
 from sparsestyle_ns.runs.scene_record import record_scene
-from sparsestyle_ns.style.painting import load_style_image
-from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.style.painting import Painting
 
 
 def measure_scene(
-    dataparser: str,
+    dataparser: DataParserConfig,
     data: Path,
     num_views: Optional[int] = None,
     view_ids: Optional[Tuple[int, ...]] = None,
@@ -27,27 +25,25 @@ def measure_scene(
     """What ns-train would decide with everything on auto.
 
     Args:
-        dataparser: its name on the command line, with its default settings.
+        dataparser: what reads the scene.
         data: the scene.
         num_views, view_ids: see `FewShotDataManagerConfig`.
         coarse_run: a run of the scene to measure the effects of stage 2 on; without one they are assumed.
         style_image: the painting; without one its palette counts as another than the photos'.
 
     Raises:
-        InputError: there is no such dataparser or scene, or something can't be read.
+        InputError: something can't be read, or the run is of another scene.
     """
-    check_parser(dataparser)
-    if not data.exists():
-        raise InputError(f"There is no {data}; name a scene's folder with --data.")
     config = FewShotDataManagerConfig(
-        data=data, dataparser=copy.deepcopy(all_dataparsers[dataparser]), num_views=num_views, view_ids=view_ids
+        data=data, dataparser=copy.deepcopy(dataparser), num_views=num_views, view_ids=view_ids
     )
     manager = config.setup(device="cpu", test_mode="inference")
     scene = manager.scene
+    effects = decide(scene, EffectSettings())
     if coarse_run is not None:
         run = read_coarse_run(coarse_run)
-        check_scene(run, record_scene(manager))
-        scene.coarse_density = run.density(manager.effects)
+        check_scene(run, record_scene(data, manager.train_dataparser_outputs, effects))
+        scene.coarse_density = run.density(effects)
     if style_image is not None:
-        scene.style_image = load_style_image(style_image)
-    return decide(scene, ALL_AUTO, manager.effects)
+        scene.style_image = Painting.read(style_image).pixels
+    return decide(scene, EffectSettings(), effects)

@@ -11,16 +11,18 @@ import numpy as np
 
 from sparsestyle_ns.data.llff import read_poses_bounds
 from sparsestyle_ns.data.transforms import check_lenses, read_transforms
-from sparsestyle_ns.prepare.photos import MIN_PHOTOS, Framing, Size
+from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, Size
 from sparsestyle_ns.utils.errors import InputError
 
 POSES_BOUNDS, TRANSFORMS = "poses_bounds.npy", "transforms.json"
 ASPECT_TOLERANCE = 0.02
 """Share by which the aspect of a photo may differ from that of its pose: sizes are whole pixels."""
-PIXEL_MAPS = ("mask_path", "depth_file_path")
-"""Entries of a frame that are pictures of the photo's old size."""
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 """Entries of a `transforms.json` that list photos by their file_path; nerfstudio wants all three where it has one."""
+PIXEL_MAPS = ("mask_path", "depth_file_path")
+"""Entries of a frame that are pictures of the photo's old size."""
+SHARED = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "ply_file_path")
+"""Entries of all frames together that hold no longer once each frame has intrinsics of its own."""
 
 
 class Poses(ABC):
@@ -36,12 +38,12 @@ class Poses(ABC):
         """Those of the photos that have poses, in the poses' order.
 
         Raises:
-            InputError: too few have.
+            InputError: there are too few, or it isn't clear which pose is whose.
         """
 
     @abstractmethod
     def size(self, index: int) -> Optional[Size]:
-        """Width and height that a pose's focal length is in units of; None where the file doesn't say."""
+        """Width and height of the photo that a pose was made for; None where the file doesn't say."""
 
     @abstractmethod
     def write(self, folder: Path, names: Sequence[str], framings: Sequence[Framing]) -> None:
@@ -95,8 +97,7 @@ class LLFFPoses(Poses):
         """See `Poses.write`."""
         rows = self.rows.copy()
         for row, framing in zip(rows, framings, strict=True):
-            focal = row[14] * framing.scaled[0] / row[9]
-            row[[9, 4, 14]] = *framing.size, focal
+            row[[9, 4, 14]] = *framing.size, row[14] * framing.scaled[0] / row[9]
         np.save(folder / POSES_BOUNDS, rows)
 
 
@@ -109,44 +110,38 @@ class TransformsPoses(Poses):
         self.path = path
         self.content: Dict[str, Any] = read_transforms(path, with_angle=False)
         check_lenses(path, self.content)
-        self._check_splits()
+        for split in SPLITS:
+            names = self.content.get(split, [])
+            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+                raise InputError(
+                    f"{path} has {split} that is no list of names: list the file_path of each photo there, or take "
+                    f"{', '.join(SPLITS)} out."
+                )
         for frame in self.content["frames"]:
             if not any(key in part for part in (frame, self.content) for key in ("fl_x", "camera_angle_x")):
                 raise InputError(f"{path} has no focal length (fl_x) for {frame['file_path']}; add it, in pixels.")
         self.used: List[Dict[str, Any]] = []
 
-    def _check_splits(self) -> None:
-        for split in SPLITS:
-            names = self.content.get(split, [])
-            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-                raise InputError(
-                    f"{self.path} has {split} that is no list of names: list the file_path of each photo there, or "
-                    f"take {', '.join(SPLITS)} out."
-                )
-
     def photos(self, found: Sequence[Path]) -> List[Path]:
-        """See `Poses.photos`; photos and frames without the other are left out.
-
-        Raises:
-            InputError: too few photos have a pose, one may have several, or none is to be trained on.
-        """
+        """See `Poses.photos`; photos and frames without the other are left out."""
         frames = self._frames_of(found)
         if len(frames) < MIN_PHOTOS:
             raise InputError(
                 f"{self.path} has poses for {len(frames)} of the {len(found)} photos, and at least {MIN_PHOTOS} are "
                 "needed; its file_path entries have to name the photos."
             )
-        self.used = [frames[path] for path in found if path in frames]
+        placed = [path for path in found if path in frames]
+        self.used = [frames[path] for path in placed]
         if self._splits([frame["file_path"] for frame in self.used]).get(SPLITS[0]) == []:
             raise InputError(
                 f"None of the photos with poses is in {SPLITS[0]} of {self.path}: list some there, or take "
                 f"{', '.join(SPLITS)} out."
             )
-        return [path for path in found if path in frames]
+        return placed
 
     def _frames_of(self, found: Sequence[Path]) -> Dict[Path, Dict[str, Any]]:
-        """The frame of each photo that has one: the one whose file_path leads there or, where none does and no other
-        photo of the name has one so, the one with the same name but for folder and suffix."""
+        """The frame of each photo that has one: that whose file_path leads there; for names that no file_path leads to,
+        that of the same name but for folder and suffix."""
         frames = self._matched(found, os.path.abspath)
         settled = {path.stem for path in frames}
         return {**frames, **self._matched([path for path in found if path.stem not in settled], lambda path: path.stem)}
@@ -179,10 +174,10 @@ class TransformsPoses(Poses):
         return {path: frames[name][0] for name, path in owners.items()}
 
     def _splits(self, names: Sequence[str]) -> Dict[str, List[str]]:
-        """Which photos to train on and which not, by new names, as far as they are used; nothing if the file has none.
+        """The file's lists of photos to train on and to hold out, as far as they are used, with new names.
 
         Args:
-            names: of the frames in use.
+            names: the new name of each frame in use.
         """
         if not any(split in self.content for split in SPLITS):
             return {}
@@ -203,12 +198,11 @@ class TransformsPoses(Poses):
         names = [f"images/{name}" for name in names]
         frames = []
         for index, (frame, name, framing) in enumerate(zip(self.used, names, framings, strict=True)):
-            frame = {key: value for key, value in frame.items() if key not in PIXEL_MAPS}
-            frames.append({**frame, "file_path": name, **self._intrinsics(index, framing)})
-        shared = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "ply_file_path")
-        content = {key: value for key, value in self.content.items() if key not in shared}
-        content.update(self._splits(names))
-        (folder / TRANSFORMS).write_text(json.dumps({**content, "frames": frames}, indent=2) + "\n")
+            kept = {key: value for key, value in frame.items() if key not in PIXEL_MAPS}
+            frames.append({**kept, "file_path": name, **self._intrinsics(index, framing)})
+        kept = {key: value for key, value in self.content.items() if key not in SHARED}
+        content = {**kept, **self._splits(names), "frames": frames}
+        (folder / TRANSFORMS).write_text(json.dumps(content, indent=2) + "\n")
 
     def _intrinsics(self, index: int, framing: Framing) -> Dict[str, float]:
         width, height = self.size(index) or framing.original
@@ -216,13 +210,11 @@ class TransformsPoses(Poses):
         focal_x = self._value(index, "fl_x")
         if focal_x is None:
             focal_x = 0.5 * width / math.tan(0.5 * self._value(index, "camera_angle_x"))
-        focal_y = self._value(index, "fl_y", focal_x)
-        center_x, center_y = self._value(index, "cx", 0.5 * width), self._value(index, "cy", 0.5 * height)
         return {
             "fl_x": across * focal_x,
-            "fl_y": down * focal_y,
-            "cx": across * center_x - framing.corner[0],
-            "cy": down * center_y - framing.corner[1],
+            "fl_y": down * self._value(index, "fl_y", focal_x),
+            "cx": across * self._value(index, "cx", 0.5 * width) - framing.corner[0],
+            "cy": down * self._value(index, "cy", 0.5 * height) - framing.corner[1],
             "w": framing.size[0],
             "h": framing.size[1],
         }

@@ -6,8 +6,12 @@ from pathlib import Path
 from typing import Dict, List, Optional
 
 import numpy as np
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
-from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
+from sparsestyle_ns.data.scene_info import scene_info
+from sparsestyle_ns.effects.background import background_color
+from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.registry import decided_on_photos
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 
@@ -70,16 +74,21 @@ class SceneRecord:
         return None
 
 
-def record_scene(datamanager: FewShotDataManager) -> SceneRecord:
-    """The record of a data manager's training views."""
-    dataset = datamanager.train_dataset
-    background = datamanager.effects.build("background")
+def record_scene(data: Path, outputs: DataparserOutputs, effects: Decisions) -> SceneRecord:
+    """The record of a run.
+
+    Args:
+        data: folder or file of the scene.
+        outputs: its training views, as read by `read_scene`.
+        effects: what was decided about it.
+    """
+    background = background_color(effects)
     return SceneRecord(
-        data=str(Path(datamanager.config.data).resolve()),
-        view_ids=list(datamanager.view_ids),
-        view_names=[path.name for path in dataset._dataparser_outputs.image_filenames],
-        scene_box=dataset.scene_box.aabb.tolist(),
-        cameras=dataset.cameras.camera_to_worlds.tolist(),
+        data=str(data.resolve()),
+        view_ids=list(scene_info(outputs).view_ids),
+        view_names=[path.name for path in outputs.image_filenames],
+        scene_box=outputs.scene_box.aabb.tolist(),
+        cameras=outputs.cameras.camera_to_worlds.tolist(),
         background_color=None if background is None else background.tolist(),
-        effects=datamanager.effects.on_photos(),
+        effects=decided_on_photos(effects),
     )

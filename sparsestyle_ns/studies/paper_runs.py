@@ -6,7 +6,7 @@ from typing import Dict, Mapping, Optional, Tuple
 
 from sparsestyle_ns.studies.runs import Run, as_pairs
 from sparsestyle_ns.studies.study import Stage, Study
-from sparsestyle_ns.style.vgg import available_backbone
+from sparsestyle_ns.style.backbones import available_backbone
 
 Settings = Mapping[str, object]
 """Values by their place in a method's config."""
@@ -31,7 +31,7 @@ COLORS_ALONE: Settings = {"pipeline.effects.view_color": "on", "pipeline.effects
 FINE_TUNING: Settings = {
     "pipeline.model.stylised_field": "coarse",
     "optimizers.fields.optimizer.lr": 5e-4,
-    "pipeline.content_weight": 0.1,
+    "pipeline.loss_weights.content": 0.1,
     "pipeline.content_decay": 1.0,
     # A sample's activations take twice the memory that the residual field's do, and are all kept.
     "pipeline.samples_per_chunk": 131072,
@@ -43,7 +43,7 @@ STYLE_KINDS: Dict[str, Settings] = {
     "frequency": {"pipeline.model.fine_encoding": "frequency"},
     "coarse-density": {"pipeline.effects.residual_density": "off"},
     **{
-        f"lambda-{weight:g}": {"pipeline.content_weight": weight, "pipeline.content_decay": 1.0}
+        f"lambda-{weight:g}": {"pipeline.loss_weights.content": weight, "pipeline.content_decay": 1.0}
         for weight in (10.0, 1.0, 0.1)
     },
 }

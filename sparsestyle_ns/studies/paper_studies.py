@@ -12,7 +12,7 @@ from sparsestyle_ns.studies.paper_runs import PaperRuns
 from sparsestyle_ns.studies.paper_tables import OF_METHODS, Comparison, ablations, needed_runs, study_sections
 from sparsestyle_ns.studies.runs import RunQueue
 from sparsestyle_ns.studies.study import Study, parse_dataparser
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.page import prepare_page, write_page
 
@@ -53,7 +53,7 @@ def check_options(options: StudyOptions) -> PaperRuns:
     if options.jobs is not None and options.jobs < 1:
         raise InputError(f"--jobs is {options.jobs}; at least one run at a time is needed.")
     for painting in options.style_images:
-        load_style_image(painting)
+        Painting.read(painting)
     prepare_page(options.output_path)
     study = Study(
         options.data,

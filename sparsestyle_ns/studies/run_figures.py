@@ -6,22 +6,22 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Callable, Dict, List, Mapping, Optional, Tuple
 
-import torch
 from jaxtyping import Float
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 from torchvision.utils import save_image
 
 from sparsestyle_ns.core.camera_paths import measuring_path
-from sparsestyle_ns.evaluation.held_out import evaluate_run, saved_report, stylisation_figures
+from sparsestyle_ns.engine.loading import evaluate_run, load_run
+from sparsestyle_ns.evaluation.held_out import saved_report, stylisation_figures
 from sparsestyle_ns.evaluation.path_frames import PathFrames, render_path
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID, missing_weights
 from sparsestyle_ns.metrics.gram import gram_matrix
 from sparsestyle_ns.metrics.image import has_lpips, image_metrics
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
-from sparsestyle_ns.runs.coarse_run import checkpoint_step, newest_checkpoint
-from sparsestyle_ns.runs.run_folder import REPORT_FILE, load_run
+from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.runs.run_folder import REPORT_FILE
 from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.progress import track
 
@@ -67,7 +67,8 @@ class PaintingMeasure:
             settings: the pipeline's config of a run; it names network and sizes.
         """
         if self._targets is None:
-            self._targets = replace(settings, style_image=self.painting).load_targets(torch.device("cpu"))
+            settings = replace(settings, style_image=self.painting)
+            self._targets = settings.targets_of(settings.load_style())
             self._gram = gram_matrix(self._targets.style_rows())
         values, art_fid = [], ArtFID.against(self._targets.style_image)
         for index in track(range(0, len(frames.stylised), STYLE_EVERY), "Style and content"):

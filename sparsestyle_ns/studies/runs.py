@@ -20,7 +20,7 @@ import yaml
 
 from sparsestyle_ns.engine.previews import preview_path
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
-from sparsestyle_ns.runs.coarse_run import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.studies.study import Stage, Study
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole

@@ -1,4 +1,7 @@
-"""What HTML pages of this package have in common: one file that needs nothing else, light or dark."""
+"""HTML pages of this package: one file that needs nothing else, light or dark, made from Jinja2 templates.
+
+`templates/base.html` has what all pages share, `templates/macros.html` pictures and tables.
+"""
 
 import base64
 import io
@@ -12,7 +15,7 @@ from jaxtyping import UInt8
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
-from sparsestyle_ns.utils.output_file import prepare_output, write_output
+from sparsestyle_ns.utils.files import prepare_output, write_output
 
 Pixels = UInt8[np.ndarray, "H W 3"]
 
@@ -20,11 +23,6 @@ LOSSLESS_PIXELS = 200_000
 """Pictures with at most this many pixels go into a page as PNG, larger ones as JPEG."""
 EXAMPLE_NAME = "index.html"
 """A good name for a page."""
-
-CONTENT_POLICY = (
-    "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
-)
-"""Keeps the page to what it carries, whatever is written into it."""
 
 
 def render_page(template: str, package: str, **values: object) -> str:
@@ -47,6 +45,55 @@ def render_page(template: str, package: str, **values: object) -> str:
     )
     environment.filters.update(data_uri=data_uri, bytes_uri=bytes_uri)
     return environment.get_template(template).render(**values)
+
+
+def data_uri(pixels: Pixels) -> str:
+    """A picture as a data URI: PNG, or JPEG where PNG would be heavy."""
+    form = "png" if pixels.shape[0] * pixels.shape[1] <= LOSSLESS_PIXELS else "jpeg"
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, form, optimize=True, quality=90)  # each takes the option that it knows
+    return bytes_uri(buffer.getvalue(), f"image/{form}")
+
+
+def bytes_uri(content: bytes, media_type: str) -> str:
+    """A file's bytes as a data URI.
+
+    Args:
+        media_type: what they are: video/mp4, image/svg+xml.
+    """
+    return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
+
+
+def prepare_page(output_path: Path) -> None:
+    """Makes the folder that a page is to be written to.
+
+    Raises:
+        InputError: it can't be made or written to, or the page's name is that of a folder.
+    """
+    prepare_output(output_path, "The page", EXAMPLE_NAME)
+
+
+def write_page(page: str, output_path: Path) -> Path:
+    """Writes a page; the file appears under its name only when it is whole.
+
+    Args:
+        page: its HTML.
+        output_path: the file; folders on the way to it are made.
+
+    Returns:
+        The file's absolute path.
+
+    Raises:
+        InputError: it can't be written there.
+    """
+    return write_output(output_path, page.encode(), "The page", EXAMPLE_NAME)
+
+
+# Pages in strings, until the studies' pages are templates too.
+
+CONTENT_POLICY = (
+    "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+)
 
 
 def html_page(title: str, style: str, body: str) -> str:
@@ -99,26 +146,6 @@ def figure(pixels: Pixels, caption: str, alternative: Optional[str] = None) -> s
     return f"<figure>{image(pixels, alternative or caption)}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
-def data_uri(pixels: Pixels) -> str:
-    """A picture as a data URI: PNG, or JPEG where PNG would be heavy."""
-    lossless = pixels.shape[0] * pixels.shape[1] <= LOSSLESS_PIXELS
-    buffer = io.BytesIO()
-    if lossless:
-        Image.fromarray(pixels).save(buffer, "PNG", optimize=True)
-    else:
-        Image.fromarray(pixels).save(buffer, "JPEG", quality=90)
-    return bytes_uri(buffer.getvalue(), f"image/{'png' if lossless else 'jpeg'}")
-
-
-def bytes_uri(content: bytes, media_type: str) -> str:
-    """A file's bytes as a data URI.
-
-    Args:
-        media_type: what they are: video/mp4, image/svg+xml.
-    """
-    return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
-
-
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], cited: Collection[str] = ()) -> str:
     """A table of plain texts as HTML; rows whose first cell is in `cited` are marked as others' figures."""
     heads = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
@@ -127,28 +154,3 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], cited: Collection[
         mark = " class=cited" if row[0] in cited else ""
         body += f"<tr{mark}>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>"
     return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table></div>'
-
-
-def prepare_page(output_path: Path) -> None:
-    """Makes the folder that a page is to be written to.
-
-    Raises:
-        InputError: it can't be made or written to, or the page's name is that of a folder.
-    """
-    prepare_output(output_path, "The page", EXAMPLE_NAME)
-
-
-def write_page(page: str, output_path: Path) -> Path:
-    """Writes a page; the file appears under its name only when it is whole.
-
-    Args:
-        page: its HTML.
-        output_path: the file; folders on the way to it are made.
-
-    Returns:
-        The file's absolute path.
-
-    Raises:
-        InputError: it can't be written there.
-    """
-    return write_output(output_path, page.encode(), "The page", EXAMPLE_NAME)

@@ -10,7 +10,6 @@ from sparsestyle_ns.core.camera_paths import (
     ARC_STEP,
     NUM_FRAMES,
     at_poses,
-    axes_meet,
     measuring_path,
     unseen_places,
 )
@@ -88,10 +87,6 @@ def test_the_path_is_the_same_each_time_and_has_the_training_cameras_lens() -> N
     # Up to rounding, which differs with where torch's vectors lie in memory.
     torch.testing.assert_close(first.camera_to_worlds, second.camera_to_worlds, atol=1e-6, rtol=0)
     assert (first.fx[3].item(), first.fy[3].item(), first.width[3].item(), first.height[3].item()) == (30, 31, 32, 24)
-
-
-def test_optical_axes_meet_where_the_cameras_look() -> None:
-    torch.testing.assert_close(axes_meet(ring(6).camera_to_worlds), torch.tensor([0.5, -0.2, 0.0]), atol=1e-4, rtol=0)
 
 
 def test_one_camera_makes_no_path() -> None:

@@ -13,6 +13,7 @@ from PIL import Image
 
 from sparsestyle_ns.core.ndc import ndc_rays
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
+from sparsestyle_ns.data.scene_info import scene_info
 from sparsestyle_ns.utils.errors import InputError
 
 DATA = Path(os.environ.get("SPARSESTYLE_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
@@ -58,6 +59,14 @@ def parse(data, split="train", **settings):
     return LLFFDataParserConfig(data=data, **settings).setup().get_dataparser_outputs(split)
 
 
+def view_ids(outputs):
+    return list(scene_info(outputs).view_ids)
+
+
+def view_names(outputs):
+    return [path.name for path in outputs.image_filenames]
+
+
 def error_of(data, **settings):
     """The message of the InputError, after seeing that it is one sentence."""
     with pytest.raises(InputError) as caught:
@@ -82,7 +91,7 @@ def test_two_cameras_worked_out_by_hand(scene):
     expected = torch.eye(3, 4).repeat(2, 1, 1)
     expected[:, 0, 3] = torch.tensor([-1 / 3, 1 / 3])
     torch.testing.assert_close(outputs.cameras.camera_to_worlds, expected)
-    torch.testing.assert_close(outputs.metadata["bounds"], torch.tensor([[4 / 3, 20 / 3], [2.0, 10.0]]))
+    assert scene_info(outputs).ndc.depth_range == pytest.approx((0.9 * 4 / 3, 1.1 * 10.0))  # with a margin of 10%
     assert outputs.dataparser_scale == pytest.approx(1 / 3)
     torch.testing.assert_close(
         outputs.dataparser_transform, torch.tensor([[1.0, 0, 0, -4], [0, 1, 0, -5], [0, 0, 1, -7]])
@@ -140,8 +149,8 @@ def test_poses_lead_back_to_those_of_the_file(scene):
 
 def test_bound_scale_sets_the_unit(scene):
     data = scene()
-    assert parse(data).metadata["bounds"].min().item() == pytest.approx(1 / 0.75)
-    assert parse(data, bound_scale=0.5).metadata["bounds"].min().item() == pytest.approx(2.0)
+    for settings, nearest in (({}, 1 / 0.75), ({"bound_scale": 0.5}, 2.0)):
+        assert scene_info(parse(data, **settings)).ndc.depth_range[0] == pytest.approx(0.9 * nearest)
 
 
 def test_both_splits_live_in_the_same_world(scene):
@@ -173,10 +182,9 @@ def test_a_size_rounded_to_whole_pixels_is_accepted(scene):
 
 
 def test_metadata_tells_the_model_how_to_map_rays_to_ndc(scene):
-    metadata = parse(scene()).metadata
-    assert metadata["space"] == "ndc"
-    assert metadata["ndc_near"] == 1.0
-    assert metadata["ndc_focal_over_half_size"] == pytest.approx((20 / 8, 20 / 6))
+    ndc = scene_info(parse(scene())).ndc
+    assert ndc.near == 1.0
+    assert ndc.focal_over_half_size == pytest.approx((20 / 8, 20 / 6))
 
 
 def test_the_scene_box_of_one_camera_is_the_ndc_cube_with_a_margin(scene):
@@ -198,9 +206,8 @@ def test_every_pixel_of_every_view_stays_inside_the_scene_box(scene, split):
     rows = np.concatenate([turned_and_moved_rows(), turned_and_moved_rows()[:4]])
     outputs = parse(scene(rows), split)
     rays = outputs.cameras.generate_rays(camera_indices=torch.arange(len(outputs.cameras))[:, None])
-    origins, directions, valid = ndc_rays(
-        rays.origins, rays.directions, outputs.metadata["ndc_focal_over_half_size"], outputs.metadata["ndc_near"]
-    )
+    ndc = scene_info(outputs).ndc
+    origins, directions, valid = ndc_rays(rays.origins, rays.directions, ndc.focal_over_half_size, ndc.near)
     assert valid.all()
     t = torch.linspace(0, 1, 9)[:, None]
     points = origins[..., None, :] + t * directions[..., None, :]
@@ -216,12 +223,10 @@ def test_every_pixel_of_every_view_stays_inside_the_scene_box(scene, split):
 def test_every_eighth_of_twenty_images_is_held_out(scene, split):
     data = scene(count=20)
     held_out, train = parse(data, split), parse(data, "train")
-    assert held_out.metadata["view_ids"] == [0, 8, 16]
-    assert train.metadata["view_ids"] == [i for i in range(20) if i not in (0, 8, 16)]
-    assert held_out.metadata["view_names"] == ["view000.png", "view008.png", "view016.png"]
-    assert [path.name for path in held_out.image_filenames] == held_out.metadata["view_names"]
+    assert view_ids(held_out) == [0, 8, 16]
+    assert view_ids(train) == [i for i in range(20) if i not in (0, 8, 16)]
+    assert view_names(held_out) == ["view000.png", "view008.png", "view016.png"]
     assert len(held_out.cameras) == 3 and len(train.cameras) == 17
-    assert held_out.metadata["bounds"].shape == (3, 2) and train.metadata["bounds"].shape == (17, 2)
 
 
 def test_cameras_belong_to_the_images_of_the_split(scene):
@@ -233,16 +238,16 @@ def test_cameras_belong_to_the_images_of_the_split(scene):
 
 def test_eval_interval_sets_how_many_are_held_out(scene):
     data = scene(count=8)
-    assert parse(data, "test", eval_interval=4).metadata["view_ids"] == [0, 4]
-    assert parse(data, "train", eval_interval=4).metadata["view_ids"] == [1, 2, 3, 5, 6, 7]
+    assert view_ids(parse(data, "test", eval_interval=4)) == [0, 4]
+    assert view_ids(parse(data, "train", eval_interval=4)) == [1, 2, 3, 5, 6, 7]
 
 
 @pytest.mark.parametrize("count", [1, 3, 8])
 def test_a_folder_of_at_most_eight_photos_is_trained_and_evaluated_on_all_and_says_so(scene, count, capsys):
     data = scene(count=count)
-    assert parse(data, "train").metadata["view_ids"] == list(range(count))
+    assert view_ids(parse(data, "train")) == list(range(count))
     assert "too few" not in capsys.readouterr().out
-    assert parse(data, "test").metadata["view_ids"] == list(range(count))
+    assert view_ids(parse(data, "test")) == list(range(count))
     assert "too few" in capsys.readouterr().out
 
 
@@ -277,7 +282,7 @@ def test_images_come_sorted_whatever_their_suffix_and_other_files_are_passed_ove
     for name in ("c.JPG", "a.png", "b.jpeg", "._a.png"):
         Image.new("RGB", (8, 6)).save(folder / name, format="PNG" if name.endswith("png") else "JPEG")
     (folder / "notes.txt").write_text("not an image")
-    assert parse(data).metadata["view_names"] == ["a.png", "b.jpeg", "c.JPG"]
+    assert view_names(parse(data)) == ["a.png", "b.jpeg", "c.JPG"]
 
 
 # What cannot be used
@@ -475,14 +480,14 @@ print(type(all_dataparsers["llff-data"]).__name__)
 @pytest.mark.skipif(not FERN.is_dir(), reason=f"{DATA} has no llff/fern; set SPARSESTYLE_DATA")
 def test_the_real_fern():
     train, test = parse(FERN, "train"), parse(FERN, "test")
-    assert test.metadata["view_ids"] == [0, 8, 16] and len(train.image_filenames) == 17
+    assert view_ids(test) == [0, 8, 16] and len(train.image_filenames) == 17
     for outputs in (train, test):
         torch.testing.assert_close(outputs.cameras.fx, torch.full_like(outputs.cameras.fx, 3260.5263 / 8))
         assert (outputs.cameras.width == 504).all() and (outputs.cameras.height == 378).all()
         rotations = outputs.cameras.camera_to_worlds[:, :, :3]
         # All cameras look forward, with up about upwards.
         assert (rotations[:, 2, 2] > 0.9).all() and (rotations[:, 1, 1] > 0.9).all()
-    bounds = torch.cat([train.metadata["bounds"], test.metadata["bounds"]])
-    assert bounds.min().item() == pytest.approx(1 / 0.75)
+    assert scene_info(train).ndc == scene_info(test).ndc
+    assert scene_info(train).ndc.depth_range[0] == pytest.approx(0.9 / 0.75)
     low, high = train.scene_box.aabb
     assert (low[:2] > -2.5).all() and (low[:2] < -1).all() and (high[:2] > 1).all() and (high[:2] < 2.5).all()

@@ -18,16 +18,22 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.effects.registry import EffectSettings
-from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig, CoarseFieldConfig
+from sparsestyle_ns.data.scene_info import NDC
+from sparsestyle_ns.effects.background import background_color
+from sparsestyle_ns.effects.base import EffectSettings
+from sparsestyle_ns.effects.exposure import build_exposure
+from sparsestyle_ns.effects.matched_depth import matched_rays
+from sparsestyle_ns.effects.registry import decide
+from sparsestyle_ns.effects.scene import Scene
+from sparsestyle_ns.fields.coarse import CoarseFieldConfig
+from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
 from sparsestyle_ns.models.hier_style import HierStyleModelConfig
 from sparsestyle_ns.pipelines import base as pipelines
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 
 BOX = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
-NDC = {"space": "ndc", "ndc_focal_over_half_size": [1.5, 2.0], "ndc_near": 0.7, "ndc_depth_range": [1.0, 9.0]}
+TO_NDC = NDC((1.5, 2.0), near=0.7, depth_range=(1.0, 9.0))
 FIELD = {"num_levels": 2, "num_layers": 2, "layer_width": 16, "feature_dim": 4}
 ORANGE = {"color": [1.0, 0.5, 0.0]}
 
@@ -48,8 +54,7 @@ def coarse_model(*on: str):
     config = CoarseFewShotModelConfig(
         coarse_field=CoarseFieldConfig(**FIELD), num_samples=6, grid_resolution=8, precision="float32"
     )
-    metadata = {"effects": decided(*on, background=ORANGE), **NDC}
-    return config.setup(scene_box=BOX, num_train_data=3, metadata=metadata)
+    return config.setup(scene_box=BOX, num_train_data=3, effects=decided(*on, background=ORANGE), ndc=TO_NDC)
 
 
 def style_model(*on: str):
@@ -58,8 +63,7 @@ def style_model(*on: str):
         **{"hash_levels": 2, "min_resolution": 4, "max_resolution": 8, "log2_table_size": 8, "layer_width": 16},
         **{"num_steps": 8, "occupancy_resolution": 4, "precision": "float32"},
     )
-    metadata = {"effects": decided(*on, background=ORANGE), **NDC}
-    return config.setup(scene_box=BOX, num_train_data=3, metadata=metadata)
+    return config.setup(scene_box=BOX, num_train_data=3, effects=decided(*on, background=ORANGE), ndc=TO_NDC)
 
 
 def rays(count: int = 20) -> RayBundle:
@@ -158,9 +162,9 @@ def test_without_lens_distortion_no_ray_is_undistorted(tmp_path: Path):
         config = FewShotDataManagerConfig(
             data=tmp_path / name / "nerfstudio",
             dataparser=NerfstudioDataParserConfig(),
-            effects=EffectSettings(lens_distortion=choice),
         )
         manager = config.setup(device="cpu", test_mode="inference")
+        manager.set_effects(decide(manager.scene, EffectSettings(lens_distortion=choice)))
         for dataset in (manager.train_dataset, manager.eval_dataset):
             assert (dataset.cameras.distortion_params is None) == (choice == "off")
         with Operations() as counted:
@@ -174,6 +178,7 @@ def test_without_lens_distortion_no_ray_is_undistorted(tmp_path: Path):
 
 def test_rays_of_a_bent_lens_are_those_that_the_photos_show(tmp_path: Path):
     import make_sample_scene
+    from sample_scene.cameras import rays_of_rows
 
     k1, width, height = 0.4, 40, 30
     options = ["--layout", "nerfstudio", "--num-views", "9", "--supersample", "1", "--distortion", str(k1)]
@@ -182,10 +187,11 @@ def test_rays_of_a_bent_lens_are_those_that_the_photos_show(tmp_path: Path):
     # The script renders along these rays; on a camera that looks along −z, a ray's place in the picture is x/−z, y/−z.
     config = FewShotDataManagerConfig(data=tmp_path / "nerfstudio", dataparser=NerfstudioDataParserConfig())
     for choice, largest, smallest in (("on", 1e-3, 0.0), ("off", 4.0, 2.0)):
-        config.effects = EffectSettings(lens_distortion=choice)
-        cameras = config.setup(device="cpu", test_mode="inference").train_dataset.cameras
+        manager = config.setup(device="cpu", test_mode="inference")
+        manager.set_effects(decide(manager.scene, EffectSettings(lens_distortion=choice)))
+        cameras = manager.train_dataset.cameras
         focal = float(cameras.fx[0])
-        true, _ = make_sample_scene._band_of_rays(np.eye(3, 4), focal, height, width, rows, 1, k1)
+        true, _ = rays_of_rows(np.eye(3, 4), focal, height, width, rows, 1, k1)
         rays = cameras.generate_rays(camera_indices=0, keep_shape=True)
         local = (rays.directions @ cameras.camera_to_worlds[0, :, :3]).reshape(-1, 3).numpy()
         errors = focal * np.linalg.norm(local[:, :2] / local[:, 2:] - true[:2].T / true[2:].T, axis=-1)
@@ -202,10 +208,10 @@ def test_without_matched_depth_no_ray_is_trained_on_that_has_no_colour(tmp_path:
         config = FewShotDataManagerConfig(
             data=tmp_path / "llff",
             dataparser=LLFFDataParserConfig(),
-            effects=EffectSettings(matched_depth=choice),
             train_num_rays_per_batch=20,
         )
         manager = config.setup(device="cpu", test_mode="val")
+        manager.set_effects(decide(manager.scene, EffectSettings(matched_depth=choice)))
         return manager.next_train(0)
 
     (more_rays, same_photos), (rays, photos) = batch("on"), batch("off")
@@ -255,10 +261,9 @@ def test_without_a_semantic_loss_no_network_is_loaded_and_no_operation_is_run(
     assert all(counts == without for counts in others)
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["background", "exposure", "view_color", "empty_space", "palette", "lens_distortion", "matched_depth"],
-)
-def test_what_is_off_builds_nothing_and_asks_for_nothing(name):
-    decisions: Decisions = decided("box")
-    assert decisions.build(name) is None
+def test_what_is_off_builds_nothing_and_reads_no_photo():
+    decisions, unread = decided("box"), Scene([Path("gone.png")], cameras=None, scene_box=BOX.aabb)
+    assert background_color(decisions) is None
+    assert build_exposure(decisions, num_photos=3) is None
+    assert matched_rays(decisions, unread) is None
+    assert CoarseFieldConfig(**FIELD).setup(decisions).direction_encoding is None

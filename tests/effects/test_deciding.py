@@ -13,8 +13,9 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.effects.registry import ALL_AUTO, EFFECTS, EffectSettings, decide, decide_again
+from sparsestyle_ns.data.reading import read_scene
+from sparsestyle_ns.effects.base import Decisions, EffectSettings
+from sparsestyle_ns.effects.registry import EFFECTS, decide, decide_again, decided_on_photos
 from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.utils.errors import InputError
 
@@ -26,9 +27,9 @@ PARSERS = {
 }
 
 
-def read_scene(folder: Path, layout: str = "llff") -> Scene:
+def training_views(folder: Path, layout: str = "llff") -> Scene:
     """All training views of a scene."""
-    return Scene.of(PARSERS[layout](data=folder).setup().get_dataparser_outputs("train"))
+    return Scene.of(read_scene(PARSERS[layout](data=folder).setup()))
 
 
 @pytest.fixture(scope="session")
@@ -42,7 +43,7 @@ def made(tmp_path_factory: pytest.TempPathFactory):
         if (layout, options) not in scenes:
             folder = tmp_path_factory.mktemp("made")
             make_sample_scene.main([str(folder), "--layout", layout, "--supersample", "1", *options])
-            scenes[layout, options] = read_scene(folder / layout, layout)
+            scenes[layout, options] = training_views(folder / layout, layout)
         return scenes[layout, options]
 
     return make
@@ -68,7 +69,7 @@ OBJECT = ("--width", "32", "--num-train", "8", "--num-val", "1", "--num-test", "
     ],
 )
 def test_auto_turns_an_effect_on_for_the_scene_that_calls_for_it_and_off_for_another(made, name, calling, other):
-    on, off = (decide(made(*scene), ALL_AUTO)[name] for scene in (calling, other))
+    on, off = (decide(made(*scene), EffectSettings())[name] for scene in (calling, other))
     assert (on.on, off.on) == (True, False)
     for decision in (on, off):
         assert decision.reason and decision.choice == "auto"
@@ -77,18 +78,18 @@ def test_auto_turns_an_effect_on_for_the_scene_that_calls_for_it_and_off_for_ano
 
 
 def test_shine_is_not_taken_for_exposure_nor_exposure_for_shine(made):
-    assert not decide(made("llff", *SEEN, "--shiny", "0.8"), ALL_AUTO).on("exposure")
-    assert not decide(made("llff", *SEEN, "--exposure", "0.5"), ALL_AUTO).on("view_color")
+    assert not decide(made("llff", *SEEN, "--shiny", "0.8"), EffectSettings()).on("exposure")
+    assert not decide(made("llff", *SEEN, "--exposure", "0.5"), EffectSettings()).on("view_color")
 
 
 def test_exposures_are_measured_as_they_were_made(made):
-    import make_sample_scene
     import numpy as np
+    from sample_scene.writers import photo_gains
 
     from sparsestyle_ns.effects.exposure import fit_gains
 
     gains, _ = fit_gains(made("llff", *SEEN, "--exposure", "0.5").matches)
-    expected = np.log(make_sample_scene.photo_gains(9, 0.5, [0, 8]))[[1, 2, 3, 4, 5, 6, 7]]
+    expected = np.log(photo_gains(9, 0.5, [0, 8]))[[1, 2, 3, 4, 5, 6, 7]]
     # Photos are cut off at white, and bytes: a tenth of a stop is 0.07.
     assert np.abs(gains - expected).max() < 0.07
     assert np.abs(gains.mean(axis=0)).max() < 1e-6
@@ -97,12 +98,12 @@ def test_exposures_are_measured_as_they_were_made(made):
 def test_few_photos_are_not_enough_to_tell_shine_from_shape(made):
     scene = made("llff", *SEEN, "--shiny", "0.8")
     few = dataclasses.replace(scene, filenames=scene.filenames[:3], cameras=scene.cameras[:3])
-    decision = decide(few, ALL_AUTO)["view_color"]
+    decision = decide(few, EffectSettings())["view_color"]
     assert not decision.on
 
 
 def test_photos_in_which_no_points_match_have_no_measured_exposure(made):
-    decision = decide(made("blender", *OBJECT), ALL_AUTO)["exposure"]
+    decision = decide(made("blender", *OBJECT), EffectSettings())["exposure"]
     assert (decision.on, decision.measured) == (False, None)
     assert "not measurable" in decision.reason
 
@@ -156,13 +157,13 @@ THIN = fog(0.9)
 )
 def test_the_coarse_field_decides_about_empty_space_and_residual_density(made, density, skips, hazy):
     scene = dataclasses.replace(made("blender", *OBJECT), coarse_density=density)
-    decisions = decide(scene, ALL_AUTO)
+    decisions = decide(scene, EffectSettings())
     assert (decisions.on("empty_space"), decisions.on("residual_density")) == (skips, hazy)
     assert decisions["empty_space"].measured is not None
 
 
 def test_before_there_is_a_coarse_field_and_a_painting_the_papers_form_is_assumed(made):
-    decisions = decide(made("blender", *OBJECT), ALL_AUTO)
+    decisions = decide(made("blender", *OBJECT), EffectSettings())
     for name in ("empty_space", "residual_density", "palette"):
         assert decisions[name].on and decisions[name].measured is None
 
@@ -173,7 +174,7 @@ def test_a_painting_in_the_photos_own_colours_needs_no_palette_transfer(made):
     own = photo[photo[..., 3] > 0.5][:, :3].T[:, None]
     every = torch.cat([torch.from_numpy(each)[each[..., 3] > 0.5][:, :3] for each in scene.photos]).T[:, None]
     for painting, on in ((every, False), (1.0 - own, True)):
-        assert decide(dataclasses.replace(scene, style_image=painting), ALL_AUTO).on("palette") == on
+        assert decide(dataclasses.replace(scene, style_image=painting), EffectSettings()).on("palette") == on
 
 
 def test_a_setting_overrules_what_was_measured_and_the_reason_says_so(made):
@@ -187,12 +188,12 @@ def test_space_has_exactly_one_layout(made):
     scene = made("blender", *OBJECT)
     layouts = ("ndc", "box", "contraction")
     for settings, expected in (
-        (ALL_AUTO, "box"),
+        (EffectSettings(), "box"),
         (EffectSettings(box="off"), "contraction"),
         (EffectSettings(contraction="on"), "contraction"),
     ):
         decisions = decide(scene, settings)
-        assert [name for name in layouts if decisions.on(name)] == [expected] == [decisions.layout]
+        assert [name for name in layouts if decisions.on(name)] == [expected]
     with pytest.raises(InputError, match="box and contraction on"):
         decide(scene, EffectSettings(box="on", contraction="on"))
     with pytest.raises(InputError, match="turn one on: box, contraction"):
@@ -207,19 +208,11 @@ def test_what_a_scene_cant_have_is_refused(made, name, reason):
 
 def test_a_stylised_run_takes_over_what_photos_decided_and_refuses_to_decide_otherwise(made):
     scene, coarse = made("blender", *OBJECT), decided("box", "background", "exposure", "empty_space")
-    decisions = decide(scene, ALL_AUTO, coarse)
-    assert decisions.on_photos() == coarse.on_photos()
+    decisions = decide(scene, EffectSettings(), coarse)
+    assert decided_on_photos(decisions) == decided_on_photos(coarse)
     assert decisions.on("residual_density")
     with pytest.raises(InputError, match=r"exposure is off, but the coarse run has it on"):
         decide(scene, EffectSettings(exposure="off"), coarse)
-
-
-def test_what_a_run_was_made_before_is_off_in_it(made):
-    older = Decisions(tuple(item for item in decided("box", "exposure").items if item.name != "matched_depth"))
-    assert older.build("matched_depth") is None
-    decisions = decide(made("blender", *OBJECT), ALL_AUTO, older)
-    assert not decisions.on("matched_depth") and decisions.on("exposure")
-    assert "not known" in decisions["matched_depth"].reason
 
 
 def test_a_decision_is_made_again_only_where_nobody_asked_for_it(made):
@@ -235,11 +228,21 @@ def test_decisions_survive_being_written_down(made):
 
 
 def test_the_table_has_a_line_for_every_effect_in_order(made):
-    decisions = decide(made("blender", *OBJECT), ALL_AUTO)
+    decisions = decide(made("blender", *OBJECT), EffectSettings())
     lines = decisions.text().splitlines()
     assert [line.split()[0] for line in lines] == ["effect", *EFFECTS]
     assert len(decisions.markdown().splitlines()) == len(EFFECTS) + 2
-    assert {field.name for field in dataclasses.fields(EffectSettings)} == EFFECTS.keys()
+
+
+def test_the_settings_are_the_effects_in_order():
+    assert [field.name for field in dataclasses.fields(EffectSettings)] == list(EFFECTS)
+
+
+def test_the_command_takes_a_dataparsers_options_and_hands_them_on(llff_scene, capsys):
+    main(["effects", "--data", str(llff_scene), "--", "llff-data", "--eval-interval", "4"])
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[1].startswith("ndc")
+    assert printed.splitlines()[-1].endswith(f"--data {llff_scene} llff-data --eval-interval 4")
 
 
 def test_an_unknown_dataparser_and_a_missing_folder_are_named(tmp_path):

@@ -7,23 +7,23 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
+from sparsestyle_ns.data.features import mutual_matches
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.data.matches import (
     LENSES,
     PointMatches,
     distances_along,
     epipolar_error,
-    mutual_matches,
     rays_of,
     sample,
     undistorted,
 )
-from sparsestyle_ns.effects.exposure import Exposure, fit_gains
-from sparsestyle_ns.effects.layouts import meeting_point, viewing_spread
-from sparsestyle_ns.effects.lens_distortion import LensDistortion, largest_shift
-from sparsestyle_ns.effects.matched_depth import MatchedDepth, matched_rays
+from sparsestyle_ns.data.reading import read_scene
+from sparsestyle_ns.effects.exposure import fit_gains, measure_exposure
+from sparsestyle_ns.effects.lens_distortion import largest_shift, measure_lens_distortion
+from sparsestyle_ns.effects.matched_depth import measure_matched_depth, triangulate
 from sparsestyle_ns.effects.scene import Scene, border, read_rgba
-from sparsestyle_ns.effects.view_color import ViewColor
+from sparsestyle_ns.effects.view_color import measure_view_color
 from sparsestyle_ns.utils.errors import InputError
 
 
@@ -33,21 +33,6 @@ def camera_at(position, back) -> np.ndarray:
     right = np.cross([0.0, 1.0, 0.0], back)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(back, right), back, np.asarray(position, float)], axis=-1)
-
-
-def test_the_spread_of_viewing_directions_is_the_largest_angle_from_their_mean():
-    pair = np.stack([camera_at((0, 0, 0), (np.sin(a), 0, np.cos(a))) for a in np.radians([-30, 30])])
-    assert viewing_spread(pair) == pytest.approx(30)
-    assert viewing_spread(pair[:1]) == pytest.approx(0, abs=1e-5)
-    opposite = np.stack([camera_at((0, 0, 0), (0, 0, z)) for z in (1, -1)])
-    assert viewing_spread(opposite) == 180
-
-
-def test_cameras_around_a_point_meet_there():
-    point = np.array([0.3, -0.2, 0.5])
-    backs = np.array([[1.0, 0.1, 0.2], [-0.4, 0.3, 1.0], [0.2, -0.5, -1.0]])
-    cameras = np.stack([camera_at(point + 3 * back, back) for back in backs])
-    assert meeting_point(cameras) == pytest.approx(point)
 
 
 def test_a_true_match_obeys_the_cameras_and_a_shifted_one_is_off_by_the_shift():
@@ -123,10 +108,10 @@ def test_of_other_cameras_effects_say_that_nothing_is_measured():
     kinds = torch.tensor([[CameraType.PERSPECTIVE.value], [CameraType.EQUIRECTANGULAR.value]])
     poses = torch.eye(4)[None, :3].repeat(2, 1, 1)
     cameras = Cameras(poses, 50.0, 50.0, 50.0, 25.0, 100, 50, camera_type=kinds)
-    scene = Scene([Path("a.png"), Path("b.png")], cameras, torch.tensor([[-1.0] * 3, [1.0] * 3]), {})
+    scene = Scene([Path("a.png"), Path("b.png")], cameras, torch.tensor([[-1.0] * 3, [1.0] * 3]))
     scene.photos = [np.random.default_rng(index).uniform(size=(50, 100, 4)).astype(np.float32) for index in range(2)]
-    for effect in (Exposure(), ViewColor(), MatchedDepth()):
-        found = effect.measure(scene)
+    for measure in (measure_exposure, measure_view_color, measure_matched_depth):
+        found = measure(scene)
         assert (found.on, found.value) == (False, None)
         assert found.reason.startswith("not measurable: points are matched between perspective and fisheye cameras")
         assert "equirectangular" in found.reason
@@ -135,7 +120,7 @@ def test_of_other_cameras_effects_say_that_nothing_is_measured():
 def test_only_the_nearest_neighbours_of_each_other_match_and_only_where_they_stand_out():
     first = np.eye(4)[:3]
     second = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0.02, 0, 0.7, 0.71], [0, 0, 0.71, 0.7]])
-    here, there = mutual_matches(first, second / np.linalg.norm(second, axis=1, keepdims=True))
+    here, there = mutual_matches(first, second / np.linalg.norm(second, axis=1, keepdims=True), max_ratio=0.8)
     assert (here.tolist(), there.tolist()) == ([0, 1], [1, 0])
 
 
@@ -203,13 +188,13 @@ def test_points_of_a_made_scene_are_matched_at_their_true_depth(tmp_path):
     import make_sample_scene
 
     make_sample_scene.main([str(tmp_path), "--layout", "llff", "--width", "200", "--num-views", "5"])
-    scene = Scene.of(LLFFDataParserConfig(data=tmp_path / "llff").setup().get_dataparser_outputs("train"))
-    rays = matched_rays(scene)
+    scene = Scene.of(read_scene(LLFFDataParserConfig(data=tmp_path / "llff").setup()))
+    rays = triangulate(scene)
     assert len(rays) >= 200
     # Both rays of a point end in the same place, and nearly all between the bounds that the scene was made with.
     ends = (rays.origins + rays.distances * rays.directions).view(2, -1, 3)
     assert ((ends[0] - ends[1]).norm(dim=-1) < 0.01 * rays.distances[: len(ends[0]), 0]).float().mean() > 0.95
-    near, far = scene.metadata["ndc_depth_range"]
+    near, far = scene.ndc.depth_range
     depth = -ends[0, :, 2]
     assert ((depth > near) & (depth < far)).float().mean() > 0.95
 
@@ -232,7 +217,7 @@ def test_the_shift_by_a_lens_is_that_of_the_corner():
 def test_parameters_without_which_a_camera_has_no_rays_are_kept():
     cameras = lens(0.0)
     cameras.camera_type[:] = CameraType.FISHEYE624.value
-    found = LensDistortion().measure(Scene([Path("a.png")], cameras, torch.tensor([[-1.0] * 3, [1.0] * 3]), {}))
+    found = measure_lens_distortion(Scene([Path("a.png")], cameras, torch.tensor([[-1.0] * 3, [1.0] * 3])))
     assert (found.on, found.value) == (True, None)
 
 

@@ -3,19 +3,21 @@
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 import torch
 import yaml
 from conftest import TINY, TINY_STYLE, decided, ns_train, only_run
 
-import sparsestyle_ns.pipelines.datamanager as datamanager
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.exposure import ExposureCorrection
-from sparsestyle_ns.effects.registry import EFFECTS
-from sparsestyle_ns.gallery.page import RunPictures, gallery_page
-from sparsestyle_ns.runs.coarse_run import newest_checkpoint
-from sparsestyle_ns.runs.run_folder import find_config, load_run
+from sparsestyle_ns.effects.registry import EFFECTS, decided_on_photos
+from sparsestyle_ns.engine.loading import load_run
+from sparsestyle_ns.gallery.layout import RunPictures, gallery_page
+from sparsestyle_ns.pipelines import base as pipelines
+from sparsestyle_ns.runs.checkpoints import newest_checkpoint
+from sparsestyle_ns.runs.run_folder import find_config
 from sparsestyle_ns.viewer.effects_panel import EffectsPanel
 
 AUTO = [flag for flag in TINY if flag not in ("--pipeline.effects.empty-space", "on")]
@@ -40,7 +42,7 @@ def refuse(*arguments: object) -> None:
 def test_a_loaded_run_has_what_was_decided_and_measures_nothing(
     runs: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.setattr(datamanager, "decide", refuse)
+    monkeypatch.setattr(pipelines, "decide", refuse)
     for run in (runs.coarse, runs.style):
         _, pipeline, _ = load_run(find_config(run))
         saved = decisions_of(run)
@@ -51,7 +53,7 @@ def test_a_loaded_run_has_what_was_decided_and_measures_nothing(
 
 def test_a_stylised_run_takes_over_what_photos_decided_and_measures_the_rest(runs: SimpleNamespace) -> None:
     coarse, style = decisions_of(runs.coarse), decisions_of(runs.style)
-    assert [coarse[name] for name in coarse.on_photos()] == [style[name] for name in coarse.on_photos()]
+    assert [coarse[name] for name in decided_on_photos(coarse)] == [style[name] for name in decided_on_photos(coarse)]
     for name in ("empty_space", "residual_density", "palette"):
         assert coarse[name].measured is None and style[name].measured is not None
 
@@ -128,14 +130,15 @@ def test_the_page_has_a_line_for_every_effect() -> None:
 def view():
     import numpy as np
 
-    from sparsestyle_ns.gallery.page import View
+    from sparsestyle_ns.gallery.layout import View
 
     picture = np.zeros((4, 4, 3), np.uint8)
-    return View("view", picture, picture)
+    return View("view", picture, picture, picture, picture)
 
 
-def test_the_viewer_shows_the_table() -> None:
-    shown = []
-    gui = SimpleNamespace(add_markdown=lambda text, visible: shown.append(text))
-    EffectsPanel(decided("box").markdown).install(SimpleNamespace(gui=gui))
-    assert len(shown) == 1 and "| box | on |" in shown[0]
+def test_the_viewer_lists_every_effect() -> None:
+    gui = MagicMock()
+    viewer = SimpleNamespace(viser_server=SimpleNamespace(gui=gui))
+    EffectsPanel(SimpleNamespace(effects=decided("box")))._setup(viewer)
+    (shown,) = (call.args[0] for call in gui.add_markdown.call_args_list)
+    assert "**box** on: " in shown and len(shown.split("\n\n")) == len(EFFECTS)

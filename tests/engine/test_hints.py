@@ -60,11 +60,11 @@ def test_resuming_a_run_that_something_else_began_names_its_checkpoints() -> Non
 
 
 def test_after_the_effects_comes_training_on_the_same_views() -> None:
-    config = parsed(after_effects("llff-data", Path("fern"), None, (1, 10, 19), None, None))
+    config = parsed(after_effects(LLFFDataParserConfig(), Path("fern"), None, (1, 10, 19), None, None))
     assert config.method_name == "coarse-fewshot"
     assert config.pipeline.datamanager.view_ids == (1, 10, 19)
     assert config.data == Path("fern")
-    config = parsed(after_effects("llff-data", Path("fern"), 5, None, Path("run"), Path("hat.jpg")))
+    config = parsed(after_effects(LLFFDataParserConfig(), Path("fern"), 5, None, Path("run"), Path("hat.jpg")))
     assert config.method_name == "hier-style"
     assert config.pipeline.coarse_run == Path("run")
     assert config.pipeline.style_image == Path("hat.jpg")

@@ -21,9 +21,9 @@ from sparsestyle_ns.data.llff import LLFFDataParserConfig, read_poses_bounds
 from sparsestyle_ns.data.photos import open_photo, photo_size
 from sparsestyle_ns.data.view_selection import select_views
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
-from sparsestyle_ns.prepare.photos import frame_photos
+from sparsestyle_ns.prepare.framing import frame_photos
 from sparsestyle_ns.prepare.poses import TransformsPoses, fits
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 
 FUZZ = settings(
@@ -62,7 +62,7 @@ def read_or_refuse(read: Any, *arguments: Any) -> None:
 
 def load_scene(folder: Path, parser: Any) -> None:
     config = FewShotDataManagerConfig(data=folder, dataparser=parser)
-    config.setup(device="cpu", test_mode="val").setup_train()
+    config.setup(device="cpu", test_mode="val").load_pixels()
 
 
 @pytest.fixture()
@@ -132,7 +132,7 @@ def test_one_extreme_number_in_the_poses_is_refused_or_gives_finite_rays(llff_co
     config = FewShotDataManagerConfig(data=llff_copy, dataparser=LLFFDataParserConfig())
     try:
         manager = config.setup(device="cpu", test_mode="val")
-        manager.setup_train()
+        manager.load_pixels()
     except InputError:
         return
     assert manager.pixels.origins.isfinite().all()
@@ -193,7 +193,7 @@ def test_transforms_with_strange_values_are_read_or_refused(ring, tmp_path, plac
     parser = BlenderDataParserConfig() if blender else NerfstudioDataParserConfig(downscale_factor=1)
     try:
         manager = FewShotDataManagerConfig(data=folder, dataparser=parser).setup(device="cpu", test_mode="val")
-        manager.setup_train()
+        manager.load_pixels()
     except InputError as error:
         assert "\n" not in str(error)
         return
@@ -280,7 +280,7 @@ def test_damaged_images_are_read_or_refused(tmp_path, image, cuts):
     path.write_bytes(damaged(IMAGES[image], cuts))
     read_or_refuse(open_photo, path)
     try:
-        picture = load_style_image(path)
+        picture = Painting.read(path).pixels
     except InputError as error:
         assert "\n" not in str(error)
         return

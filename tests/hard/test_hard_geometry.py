@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from conftest import decided
 from hard.table import hard_case
 from nerfstudio.data.scene_box import SceneBox
 from torch.nn.functional import normalize
@@ -16,7 +17,7 @@ from sparsestyle_ns.core.spaces import (
     contract,
     intersect_box,
 )
-from sparsestyle_ns.effects.layouts import Contraction
+from sparsestyle_ns.effects.layouts import build_space
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.rendering.baked_kernels import _is_occupied
 from sparsestyle_ns.rendering.render import render_coarse
@@ -36,7 +37,7 @@ def forward_facing(scale=1.0, depth_range=(1.5, 9.0)):
 
 
 def contracted(aabb):
-    return Contraction().build({}, scene_box=SceneBox(aabb=aabb))
+    return build_space(decided("contraction"), SceneBox(aabb=aabb), ndc=None)
 
 
 def rays(count=64, seed=0):

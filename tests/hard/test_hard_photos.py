@@ -37,7 +37,7 @@ def sentence_about(scenes: dict, kind: str, tmp_path: Path, spoil: Callable[[Pat
     spoil(spoilt / photo)
     config = FewShotDataManagerConfig(data=spoilt, dataparser=parser())
     with pytest.raises(InputError) as refused:
-        config.setup(device="cpu", test_mode="val").setup_train()
+        config.setup(device="cpu", test_mode="val").load_pixels()
     message = str(refused.value)
     assert str(spoilt / photo) in message
     assert "\n" not in message
@@ -53,7 +53,7 @@ def repainted(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], No
 
 def test_a_scene_whose_photos_are_all_right_is_read(scenes: dict) -> None:
     for folder, parser, _ in scenes.values():
-        FewShotDataManagerConfig(data=folder, dataparser=parser()).setup(device="cpu", test_mode="val").setup_train()
+        FewShotDataManagerConfig(data=folder, dataparser=parser()).setup(device="cpu", test_mode="val").load_pixels()
 
 
 KINDS = pytest.mark.parametrize("kind", ["llff", "blender", "blender, first"])
@@ -167,10 +167,10 @@ def test_a_mask_that_doesnt_fit_is_named(tmp_path, spoil):
         Image.fromarray(np.full((12, 16), 255, np.uint8)).save(tmp_path / frame["mask_path"])
     path.write_text(json.dumps(content))
     config = FewShotDataManagerConfig(data=tmp_path, dataparser=NerfstudioDataParserConfig(eval_mode="all"))
-    config.setup(device="cpu", test_mode="val").setup_train()
+    config.setup(device="cpu", test_mode="val").load_pixels()
     if spoil == "size":
         Image.fromarray(np.full((5, 16), 255, np.uint8)).save(tmp_path / "images" / "mask_2.png")
     else:
         (tmp_path / "images" / "mask_2.png").write_bytes(b"no mask")
     with pytest.raises(InputError, match=r"The mask .*mask_2\.png doesn't fit .*2\.png"):
-        config.setup(device="cpu", test_mode="val").setup_train()
+        config.setup(device="cpu", test_mode="val").load_pixels()

@@ -25,8 +25,8 @@ from PIL import ExifTags, Image
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.pipelines.datamanager import read_scene
-from sparsestyle_ns.prepare.command import prepare_scene
+from sparsestyle_ns.data.reading import read_scene
+from sparsestyle_ns.prepare.prepare_scene import prepare_scene
 from sparsestyle_ns.utils.errors import InputError
 
 

@@ -34,8 +34,7 @@ from sparsestyle_ns.studies.paper_tables import (
 from sparsestyle_ns.studies.run_figures import PaintingMeasure, measure_run
 from sparsestyle_ns.studies.runs import Run, RunQueue, picture_after
 from sparsestyle_ns.studies.study import Study
-from sparsestyle_ns.style import vgg
-from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.style.backbones import BACKBONES
 
 
 def paper_runs(scene: Path = Path("fern"), folder: Path = Path("outputs"), **settings: object) -> PaperRuns:
@@ -76,10 +75,8 @@ def test_each_ablation_of_the_paper_is_a_run_and_none_is_done_twice(painting: Pa
 def test_without_a_feature_network_the_semantic_loss_is_left_out_and_said_to_be(
     painting: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def no_weights(backbone: str, weights: None) -> None:
-        raise InputError("There are no weights.")
-
-    monkeypatch.setattr(vgg, "_find_weights", no_weights)
+    for kind in BACKBONES.values():
+        monkeypatch.setattr(kind, "find_weights", lambda: None)
     runs = paper_runs()
     kinds = runs.coarse_kinds()
     assert kinds == ("ours", "paper", "vanilla", "freenerf")
@@ -110,7 +107,7 @@ def test_every_setting_of_every_kind_is_one_of_its_method(llff_scene: Path, pain
     assert [kind for kind, config in settings.items() if config.effects.residual_density == "off"] == ["coarse-density"]
     assert all(parsed[run.name].logging.steps_per_log == 1 for run in found)
     assert {parsed[run.name].pipeline.backbone for run in found} == {runs.found_backbone} == {"vgg16-shift-tolerant"}
-    assert [settings[f"lambda-{w}"].content_weight for w in ("10", "1", "0.1")] == [10.0, 1.0, 0.1]
+    assert [settings[f"lambda-{w}"].loss_weights["content"] for w in ("10", "1", "0.1")] == [10.0, 1.0, 0.1]
     assert all(parsed[run.name].pipeline.style_image == painting for run in found)
 
 

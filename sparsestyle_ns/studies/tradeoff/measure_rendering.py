@@ -18,7 +18,7 @@ from sparsestyle_ns.core.occupancy import Occupancy
 from sparsestyle_ns.core.precision import Precision, autocast, multiplies_bfloat16, multiplies_tf32
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
-from sparsestyle_ns.rendering.baked import Rays, render_baked
+from sparsestyle_ns.rendering.baked import render_baked
 from sparsestyle_ns.rendering.render import POINTS_PER_CALL, render_coarse
 from sparsestyle_ns.studies.study import flag_of, get_setting, with_setting
 from sparsestyle_ns.studies.tradeoff.curves import Curve, Values
@@ -258,9 +258,7 @@ def _measure_baking(bench: Workbench, curve: Curve, budget: Budget) -> None:
             if resolution is None:
                 return bench.picture(model.get_outputs(rays))
             segments = model.space.segments(rays.origins, rays.directions)
-            limits = model.config.num_steps, model.space.unbounded, model.config.min_transmittance
-            packed = Rays(segments, model.occupancy, *limits)
-            fine, coarse = render_baked(volumes[resolution], packed, model.background)
+            fine, coarse = render_baked(volumes[resolution], segments, model.marching, model.background)
             return fine.rgb if bench.is_stylised else coarse.rgb
 
         at = frame % len(flight)

@@ -15,6 +15,7 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig, MultiS
 from torch import Tensor
 
 from sparsestyle_ns.data.view_selection import evenly_spaced
+from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.losses.stylization import StyleTargets
@@ -23,8 +24,8 @@ from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
-from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig, SceneView
-from sparsestyle_ns.rendering.frozen_view import FrozenView
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig, StyleInputs
+from sparsestyle_ns.pipelines.scene_views import SceneViews
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
 from sparsestyle_ns.runs.scene_record import record_scene
 from sparsestyle_ns.studies.study import Study
@@ -41,32 +42,6 @@ LOADING_SHARE = 0.05
 """Part of all time that evaluating a coarse run may take before anything is measured; else one view stands for all."""
 PROBE_STEPS = 3
 """Iterations from which the time of one is estimated, after one that doesn't count."""
-
-
-class SharingPipeline(HierStylePipeline):
-    """A stage-2 pipeline that works out only what no run before it has, on the same photos, coarse field and painting.
-
-    Attributes:
-        bench: keeps what runs have in common.
-        check: called before a view is frozen; raises `OutOfTimeError` where there is no time for it.
-    """
-
-    bench: "Workbench"
-    check: Callable[[], None]
-
-    def prepare_style(self) -> None:
-        """Takes the painting's features from a run before, or makes them."""
-        self.targets = self.bench.targets_for(self.config)
-
-    def _freeze_views(self) -> List[SceneView]:
-        if self.bench.scene_views is None:
-            self.bench.scene_views = super()._freeze_views()
-        # Features depend on the size that the network sees, which a run may change.
-        return [replace(view, features=None) for view in self.bench.scene_views]
-
-    def _freeze(self, origins: Tensor, directions: Tensor, keep_bytes: float) -> FrozenView:
-        self.check()
-        return super()._freeze(origins, directions, keep_bytes)
 
 
 def squeezed(config: SparseStyleTrainerConfig, iterations: int) -> SparseStyleTrainerConfig:
@@ -122,11 +97,13 @@ class Workbench:
         self.manager: FewShotDataManager = self.coarse_config.pipeline.datamanager.setup(
             device=str(self.device), test_mode="test", world_size=1, local_rank=0
         )
+        self.effects = decide(self.manager.scene, self.coarse_config.pipeline.effects)
+        self.manager.set_effects(self.effects)
         self.eval_dataset = self.manager.eval_dataset
         count = min(HELD_OUT_VIEWS, len(self.eval_dataset))
         self.views = list(evenly_spaced(len(self.eval_dataset), count))
         self.photos = {view: self.eval_dataset[view]["image"][..., :3].to(self.device) for view in self.views}
-        self.scene_views: Optional[List[SceneView]] = None
+        self.scene_views: Optional[SceneViews] = None
         self._targets: Dict[Tuple[int, Optional[int], Optional[int]], StyleTargets] = {}
         self.targets = None if style_image is None else self.targets_for(self.style_config.pipeline)
         self.coarse_state: Optional[Dict[str, Tensor]] = None
@@ -140,7 +117,8 @@ class Workbench:
 
     def _adopt_coarse_run(self, folder: Path) -> None:
         run = read_coarse_run(folder)
-        check_scene(run, record_scene(self.manager))
+        scene = record_scene(self.study.data, self.manager.train_dataparser_outputs, self.effects)
+        check_scene(run, scene)
         config = copy.deepcopy(self.coarse_config)
         config.pipeline.model = copy.deepcopy(run.config.pipeline.model)
         model = self._setup_pipeline(config).model
@@ -190,11 +168,12 @@ class Workbench:
         """The painting's features with a run's settings, worked out once."""
         key = config.feature_side, config.style_side, config.style_features
         if key not in self._targets:
-            self._targets[key] = config.load_targets(self.device)
+            painting, backbone = config.load_style()
+            self._targets[key] = config.targets_of(StyleInputs(painting, backbone.to(self.device)))
         return self._targets[key]
 
     def _setup_pipeline(self, config: SparseStyleTrainerConfig) -> CheckedPipeline:
-        config.pipeline.decided = self.manager.effects
+        config.pipeline.decided = self.effects
         return config.pipeline.setup(device=str(self.device), test_mode="test", world_size=1, local_rank=0)
 
     def start(self, config: SparseStyleTrainerConfig, budget: Budget, seed: int = 0) -> Training:
@@ -208,17 +187,20 @@ class Workbench:
         if hasattr(config.pipeline.model, "seed"):
             config.pipeline.model.seed += seed
         config.pipeline.datamanager.seed += seed
-        config.pipeline.decided = self.manager.effects
+        config.pipeline.decided = self.effects
         if not isinstance(config.pipeline, HierStylePipelineConfig):
             return Training(config, self.device)
 
-        def sharing(config: HierStylePipelineConfig, **kwargs: object) -> SharingPipeline:
-            pipeline = SharingPipeline(config, **kwargs)
-            pipeline.bench, pipeline.check = self, budget.check
-            return pipeline
+        def share(pipeline: HierStylePipeline) -> None:
+            budget.check()
+            pipeline.targets = self.targets_for(config.pipeline)
+            if self.scene_views is None:
+                self.scene_views = pipeline.freeze_views()
+            for view in self.scene_views.views:
+                view.features = None  # they depend on the size that the network sees, which a run may change
+            pipeline.scene_views = self.scene_views
 
-        config.pipeline._target = sharing
-        return Training(config, self.device, self.coarse_state)
+        return Training(config, self.device, self.coarse_state, share)
 
     def adapted_style_config(self) -> SparseStyleTrainerConfig:
         """Stage 2's preset with the shape of the coarse field that there is.

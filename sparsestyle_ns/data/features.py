@@ -1,0 +1,63 @@
+"""SIFT features of photos (Lowe 2004), and which features of two photos look alike."""
+
+from dataclasses import dataclass
+from typing import Tuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+
+@dataclass
+class Features:
+    """The features of a photo.
+
+    Attributes:
+        points: where they are, (x, y) in pixels; the centre of the first pixel is (0, 0).
+        descriptors: what they look like, as vectors of length 1.
+    """
+
+    points: Float[np.ndarray, "features 2"]
+    descriptors: Float[np.ndarray, "features 128"]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def find_features(grey: UInt8[np.ndarray, "H W"], count: int, min_contrast: float = 0.04) -> Features:
+    """The SIFT features of a grey picture.
+
+    Args:
+        grey: the picture.
+        count: how many to keep at most, the strongest first.
+        min_contrast: contrast below which a feature is dropped; 0.04 is OpenCV's default.
+    """
+    sift = cv2.SIFT_create(nfeatures=count, contrastThreshold=min_contrast)
+    keypoints, descriptors = sift.detectAndCompute(grey, None)
+    if not keypoints:
+        return Features(np.empty((0, 2)), np.empty((0, 128), np.float32))
+    # Square roots of the L1-normalised descriptor: Hellinger's distance (Arandjelović and Zisserman 2012).
+    descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
+    return Features(np.array([keypoint.pt for keypoint in keypoints]), descriptors)
+
+
+def mutual_matches(
+    first: Float[np.ndarray, "features 128"], second: Float[np.ndarray, "others 128"], max_ratio: float
+) -> Tuple[Int[np.ndarray, "matches"], Int[np.ndarray, "matches"]]:
+    """Which unit descriptors are each other's nearest, and clearly nearer than the second nearest.
+
+    Args:
+        first, second: the descriptors of two photos.
+        max_ratio: Lowe's ratio, the best match's distance over the second best's, in (0, 1]; lower is stricter.
+
+    Returns:
+        Their places in `first` and in `second`.
+    """
+    if min(len(first), len(second)) < 2:
+        return np.empty(0, int), np.empty(0, int)
+    similarity = first @ second.T
+    best = similarity.argmax(axis=1)
+    two = np.partition(similarity, -2, axis=1)[:, -2:]
+    distances = np.sqrt(np.maximum(2.0 - 2.0 * two, 0.0))
+    good = (similarity.argmax(axis=0)[best] == np.arange(len(first))) & (distances[:, 1] < max_ratio * distances[:, 0])
+    return good.nonzero()[0], best[good]

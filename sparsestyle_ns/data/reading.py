@@ -1,0 +1,99 @@
+"""Reading a scene with any dataparser, with errors that name what is wrong; nerfstudio's own check next to nothing."""
+
+from dataclasses import dataclass, replace
+from typing import Callable, Dict, Optional, Tuple, Type
+
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+from sparsestyle_ns.data.photos import open_photo
+from sparsestyle_ns.data.scene_info import SCENE_INFO, SceneInfo
+from sparsestyle_ns.data.transforms import read_transforms
+from sparsestyle_ns.data.view_selection import BLENDER_VIEWS
+from sparsestyle_ns.utils.errors import InputError
+
+
+def check_blender_files(config: BlenderDataParserConfig, split: str) -> None:
+    """Checks the poses of a split, and the photo that gives all its cameras their size."""
+    frames = read_transforms(config.data / f"transforms_{split}.json", with_angle=True)["frames"]
+    first = frames[0]["file_path"].replace("./", "")
+    open_photo(config.data / f"{first}.png")
+
+
+def check_nerfstudio_files(config: NerfstudioDataParserConfig, split: str) -> None:
+    """Checks the poses of a capture."""
+    is_file = config.data.suffix == ".json"
+    read_transforms(config.data if is_file else config.data / "transforms.json", with_angle=False)
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """What one of nerfstudio's dataparsers lacks.
+
+    Attributes:
+        check_files: looks at the files of a split before they are read; raises an `InputError`.
+        standard_views: see `SceneInfo`.
+    """
+
+    check_files: Callable[[DataParserConfig, str], None]
+    standard_views: Optional[Tuple[int, ...]] = None
+
+
+ADAPTERS: Dict[Type[DataParserConfig], Adapter] = {
+    BlenderDataParserConfig: Adapter(check_blender_files, BLENDER_VIEWS),
+    NerfstudioDataParserConfig: Adapter(check_nerfstudio_files),
+}
+"""By the dataparser's config; others are read as they are."""
+
+
+def read_scene(parser: DataParser, split: str = "train") -> DataparserOutputs:
+    """One split of a scene, checked, with its `SceneInfo` in the metadata.
+
+    Raises:
+        InputError: the scene can't be read, or a camera in it can't be used.
+    """
+    config = parser.config
+    adapter = next((adapter for kind, adapter in ADAPTERS.items() if isinstance(config, kind)), None)
+    if adapter is not None:
+        adapter.check_files(config, split)
+    try:
+        outputs = parser.get_dataparser_outputs(split)
+    except InputError:
+        raise
+    except Exception as error:  # a file that isn't as a parser expects it shows itself in any kind of error
+        name = type(config).__name__.removesuffix("DataParserConfig").lower()
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"{config.data} can't be read as a scene of the kind {name} ({type(error).__name__}: {reason}); correct "
+            "its files, or choose the dataparser that they were made for."
+        ) from error
+    check_cameras(outputs)
+    if SCENE_INFO in outputs.metadata:
+        return outputs
+    info = SceneInfo(
+        view_ids=tuple(range(len(outputs.image_filenames))),
+        standard_views=None if adapter is None else adapter.standard_views,
+    )
+    return replace(outputs, metadata={**outputs.metadata, SCENE_INFO: info})
+
+
+def check_cameras(outputs: DataparserOutputs) -> None:
+    """Makes sure that cameras are finite and have an angle of view.
+
+    Raises:
+        InputError: one isn't or hasn't; its photo is named.
+    """
+    cameras = outputs.cameras
+    if len(cameras) == 0:  # a split may be empty
+        return
+    sizes = torch.cat([cameras.fx, cameras.fy, cameras.width, cameras.height], dim=-1)
+    numbers = torch.cat([cameras.camera_to_worlds.flatten(1), sizes, cameras.cx, cameras.cy], dim=-1)
+    usable = numbers.isfinite().all(dim=-1) & (sizes > 0).all(dim=-1)
+    if not usable.all():
+        photo = outputs.image_filenames[int((~usable).nonzero()[0])]
+        raise InputError(
+            f"The camera of {photo} has a pose that is not finite, or a focal length or size that is not above 0: "
+            "correct it, or take the photo out of the scene."
+        )

@@ -1,0 +1,158 @@
+"""Reading photos as cameras and telephones leave them, and bringing them to one size."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import List, Sequence, Tuple
+
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
+
+from sparsestyle_ns.data.photos import images_in
+from sparsestyle_ns.utils.errors import InputError
+
+HEIC_SUFFIXES = (".heic", ".heif")
+SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", *HEIC_SUFFIXES)
+LOSSLESS_SUFFIXES = (".png", ".tif", ".tiff")
+MIN_PHOTOS = 3
+JPEG_QUALITY = 95
+
+Size = Tuple[int, int]
+"""Width and height in pixels."""
+
+
+@dataclass
+class Photo:
+    """A photo.
+
+    Attributes:
+        path: its file.
+        image: its pixels, RGB, or RGBA where any are transparent.
+        orientation: how EXIF says that the stored pixels lie, from 1 (upright) to 8; 1 where it doesn't say.
+        upright: whether `image` was turned by that, where it says anything; else it has the pixels as they are stored.
+    """
+
+    path: Path
+    image: Image.Image
+    orientation: int = 1
+    upright: bool = True
+
+
+@dataclass(frozen=True)
+class Framing:
+    """What happens to a photo's pixels: it is scaled to `scaled`, then cropped to `size` from `corner` on.
+
+    Attributes:
+        original: the photo's size.
+        scaled: its size after scaling.
+        corner: column and row, after scaling, of the first pixel that is kept.
+        size: the size that all photos end up with.
+    """
+
+    original: Size
+    scaled: Size
+    corner: Tuple[int, int]
+    size: Size
+
+    @property
+    def scale(self) -> Tuple[float, float]:
+        """By how much focal lengths in pixels grow, across and down."""
+        return self.scaled[0] / self.original[0], self.scaled[1] / self.original[1]
+
+    def apply(self, image: Image.Image) -> Image.Image:
+        """The photo as it goes into the scene."""
+        if image.size != self.scaled:
+            image = image.resize(self.scaled, Image.Resampling.LANCZOS)
+        left, top = self.corner
+        return image.crop((left, top, left + self.size[0], top + self.size[1]))
+
+
+def find_photos(folder: Path) -> List[Path]:
+    """The photos of a folder, by name; where it has none, those of its folder `images`.
+
+    Raises:
+        InputError: there is no such folder, or there are fewer than three photos in it.
+    """
+    if not folder.is_dir():
+        raise InputError(f"There is no folder {folder}; name the folder that the photos are in.")
+    for place in (folder, folder / "images"):
+        photos = images_in(place, SUFFIXES) if place.is_dir() else []
+        if photos:
+            break
+    if len(photos) < MIN_PHOTOS:
+        count = {0: "no photo", 1: "only one photo"}.get(len(photos), f"only {len(photos)} photos")
+        raise InputError(
+            f"{folder} has {count} ({', '.join(SUFFIXES)}); a scene needs at least {MIN_PHOTOS}, each taken from "
+            "another place."
+        )
+    return photos
+
+
+def read_photo(path: Path, upright: bool = True) -> Photo:
+    """Reads a photo.
+
+    Args:
+        path: the file.
+        upright: whether to turn it as its EXIF orientation says; else its pixels are taken as they are stored.
+
+    Raises:
+        InputError: it can't be read, or is HEIC and the package for that is missing.
+    """
+    if path.suffix.lower() in HEIC_SUFFIXES:
+        _register_heic(path)
+    try:
+        with Image.open(path) as image:
+            image.load()  # by which Pillow turns a TIFF upright, and forgets the orientation
+            orientation = image.getexif().get(ExifTags.Base.Orientation)
+            turned = ImageOps.exif_transpose(image) if upright else image
+            transparent = turned.has_transparency_data and turned.convert("RGBA").getchannel("A").getextrema()[0] < 255
+            pixels = turned.convert("RGBA" if transparent else "RGB")
+            return Photo(path, pixels, orientation if orientation in range(2, 9) else 1, upright)
+    except UnidentifiedImageError as error:
+        raise InputError(
+            f"{path} is no image that can be read; save it again as JPEG or PNG, or take it out."
+        ) from error
+    # Decoders meet a damaged file with errors of many kinds: OSError, SyntaxError, struct.error, and others.
+    except Exception as error:
+        raise InputError(f"{path} is damaged ({error}); copy it again from the camera, or take it out.") from error
+
+
+def _register_heic(path: Path) -> None:
+    try:
+        import pillow_heif
+    except ImportError as error:
+        raise InputError(
+            f"{path} is HEIC, which needs a package more: pip install pillow-heif, or save the photos as JPEG."
+        ) from error
+    pillow_heif.register_heif_opener()
+
+
+def frame_photos(sizes: Sequence[Size]) -> List[Framing]:
+    """How photos of any sizes come to one.
+
+    Each is scaled so that its longer side is as long as the shortest longer side of all; then all are cropped, evenly
+    on both sides, to the smallest width and the smallest height. So photos by one camera keep one focal length in
+    pixels, however they were held, and the middle of the lens stays in the middle. Photos of one size stay as they are.
+    """
+    longest = min(max(size) for size in sizes)
+    scaled = [tuple(max(1, round(side * longest / max(size))) for side in size) for size in sizes]
+    width, height = (min(sides) for sides in zip(*scaled, strict=True))
+    return [
+        Framing(tuple(size), small, ((small[0] - width) // 2, (small[1] - height) // 2), (width, height))
+        for size, small in zip(sizes, scaled, strict=True)
+    ]
+
+
+def write_photos(photos: Sequence[Photo], framings: Sequence[Framing], folder: Path) -> List[str]:
+    """Writes the photos into a folder, numbered in their order; PNG if all were lossless or any has transparency.
+
+    Returns:
+        Their file names.
+    """
+    lossless = all(photo.path.suffix.lower() in LOSSLESS_SUFFIXES for photo in photos)
+    transparent = any(photo.image.mode == "RGBA" for photo in photos)
+    suffix = ".png" if lossless or transparent else ".jpg"
+    folder.mkdir(parents=True)
+    names = []
+    for number, (photo, framing) in enumerate(zip(photos, framings, strict=True)):
+        names.append(f"photo_{number:03d}{suffix}")
+        framing.apply(photo.image).save(folder / names[-1], quality=JPEG_QUALITY, subsampling=0)
+    return names

@@ -1,0 +1,200 @@
+"""`sparsestyle prepare`: photos in, a scene out."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Dict, List, Literal, Optional, Sequence
+
+import torch
+
+from sparsestyle_ns.prepare.diagnosis import check_photos
+from sparsestyle_ns.prepare.framing import (
+    MIN_PHOTOS,
+    Framing,
+    Photo,
+    find_photos,
+    frame_photos,
+    read_photo,
+    write_photos,
+)
+from sparsestyle_ns.prepare.poses import TRANSFORMS, Poses, find_poses, fits
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.ffmpeg import put_ffmpeg_on_path
+
+PoseSource = Literal["auto", "file", "colmap"]
+
+
+@dataclass
+class PreparedScene:
+    """What `prepare_scene` made.
+
+    Attributes:
+        folder: the scene.
+        parser: the dataparser that reads it.
+        names: its photos' file names.
+    """
+
+    folder: Path
+    parser: str
+    names: List[str]
+
+
+def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> PreparedScene:
+    """Makes a scene of photos: of one size, with poses.
+
+    Photos without poses are turned upright; poses from a file decide how their photos lie.
+
+    What is wrong with the photos is printed, a line each; it stops nothing.
+
+    Args:
+        photos: their folder.
+        output: the scene's folder; must not be there yet, or be empty.
+        source: where poses are from: a file beside the photos, COLMAP, or whichever of the two there is, in this order.
+
+    Raises:
+        InputError: the photos or poses can't be used, there is no way to poses, or COLMAP finds none.
+    """
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise InputError(f"{output} is there already; name a folder that isn't, with --output.")
+    paths = find_photos(photos)
+    poses = None if source == "colmap" else find_poses(paths[0].parent)
+    if source == "file" and poses is None:
+        raise InputError(f"Neither poses_bounds.npy nor transforms.json lies beside the photos in {paths[0].parent}.")
+    if poses is not None:
+        paths = poses.photos(paths)
+    read = [_read_for_pose(path, poses, index) for index, path in enumerate(paths)]
+    _say_what_is_turned(read, poses)
+    framings = frame_photos([photo.image.size for photo in read])
+    _say_what_changes(framings)
+    findings = check_photos(
+        [framing.apply(photo.image) for photo, framing in zip(read, framings, strict=True)],
+        [path.name for path in paths],
+    )
+    for sentence in findings:
+        print(f"Warning: {sentence}", flush=True)
+    if poses is None:
+        _require_colmap(paths[0].parent)
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".prepare-", dir=output.parent) as folder:
+            scene = Path(folder) / "scene"
+            scene.mkdir()
+            if poses is not None:
+                print(f"Poses are those in {poses.path}")
+                names = write_photos(read, framings, scene / "images")
+                poses.write(scene, names, framings)
+            else:
+                names = write_photos(read, framings, Path(folder) / "photos")
+                names = run_colmap(Path(folder) / "photos", scene, [path.name for path in paths], findings)
+            if output.exists():
+                output.rmdir()
+            os.replace(scene, output)
+    except OSError as error:
+        raise InputError(f"The scene can't be written to {output} ({error.strerror}); name another folder.") from error
+    return PreparedScene(output, "nerfstudio-data" if poses is None else poses.parser, names)
+
+
+def _read_for_pose(path: Path, poses: Optional[Poses], index: int) -> Photo:
+    """A photo as its pose is for it: upright where it has none yet.
+
+    COLMAP and the readers of poses_bounds.npy and transforms.json take pixels as they are stored, whatever EXIF says,
+    so a pose from a file is for these; for the upright photo only where its shape leaves no other choice.
+
+    Raises:
+        InputError: its shape is not that of its pose.
+    """
+    if poses is None:
+        return read_photo(path)
+    stored, expected = read_photo(path, upright=False), poses.size(index)
+    if expected is None or fits(stored.image.size, expected):
+        return stored
+    turned = read_photo(path)
+    if fits(turned.image.size, expected):
+        return turned
+    width, height = stored.image.size
+    raise InputError(
+        f"{path} is {width} × {height} pixels, which is no scaled version of the {expected[0]} × {expected[1]} that "
+        f"its pose in {poses.path} is for; use the photo that the pose was found with."
+    )
+
+
+def _say_what_is_turned(photos: Sequence[Photo], poses: Optional[Poses]) -> None:
+    """Prints what was done with photos that aren't stored upright, a line for each way."""
+    told: Dict[str, List[str]] = {}
+    for photo in photos:
+        if photo.orientation != 1:
+            told.setdefault(_how_turned(photo, poses), []).append(photo.path.name)
+    for words, names in told.items():
+        print(f"{', '.join(names)}: {words}")
+
+
+def _how_turned(photo: Photo, poses: Optional[Poses]) -> str:
+    if not photo.upright:
+        return f"not turned, though EXIF says so, since poses in {poses.path} are for photos as they are stored"
+    reason = "" if poses is None else f", since only then the shape is that of the pose in {poses.path}"
+    return f"turned upright, as EXIF says{reason}"
+
+
+def _say_what_changes(framings: Sequence[Framing]) -> None:
+    sizes = {framing.original for framing in framings}
+    width, height = framings[0].size
+    if len(sizes) > 1:
+        print(
+            f"The photos have {len(sizes)} sizes; their longer sides are scaled to {max(framings[0].scaled)} pixels, "
+            f"and all are cropped about the middle to {width} × {height}"
+        )
+
+
+def _require_colmap(photos: Path) -> None:
+    if shutil.which("colmap") is None:
+        raise InputError(
+            "Where the photos were taken isn't known: COLMAP, which works that out, is not installed, and no "
+            f"poses_bounds.npy or transforms.json lies beside the photos in {photos}; install COLMAP (apt install "
+            "colmap, brew install colmap, or conda install -c conda-forge colmap), or put one of the two files there."
+        )
+
+
+def run_colmap(photos: Path, scene: Path, originals: Sequence[str], findings: Sequence[str]) -> List[str]:
+    """Has COLMAP find the poses, by way of ns-process-data, which writes the scene.
+
+    Args:
+        photos: folder of the photos, of one size.
+        scene: folder to write.
+        originals: the photos' own names, in the order of those in the folder.
+        findings: what is wrong with the photos.
+
+    Returns:
+        File names of the photos that have a pose.
+
+    Raises:
+        InputError: COLMAP found the place of fewer than three photos.
+    """
+    put_ffmpeg_on_path()
+    beside = Path(sys.executable).with_name("ns-process-data")
+    command = [
+        *(shutil.which("ns-process-data") or str(beside), "images", "--data", str(photos), "--output-dir", str(scene)),
+        *("--matching-method", "exhaustive", "--num-downscales", "0"),
+        "--gpu" if torch.cuda.is_available() else "--no-gpu",
+    ]
+    print("COLMAP looks for where the photos were taken …", flush=True)
+    done = subprocess.run(command, capture_output=True, text=True)
+    advice = " ".join(findings) or "Photos that overlap by two thirds, taken a step apart, work best."
+    try:
+        frames = json.loads((scene / TRANSFORMS).read_text())["frames"]
+    except (OSError, ValueError, KeyError):
+        frames = []
+    if done.returncode != 0 or len(frames) < MIN_PHOTOS:
+        last = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:] if done.returncode else []
+        reason = f" (ns-process-data ended with: {last[0].strip()})" if last else ""
+        raise InputError(f"COLMAP found where {len(frames)} of {len(originals)} photos were taken{reason}. {advice}")
+    placed = [Path(frame["file_path"]).name for frame in frames]
+    numbers = {int(Path(name).stem.rsplit("_", 1)[-1]) for name in placed}
+    missing = [name for number, name in enumerate(originals, start=1) if number not in numbers]
+    if missing:
+        print(f"Warning: COLMAP couldn't tell where {', '.join(missing)} was taken; the scene does without. {advice}")
+    return placed
