@@ -180,7 +180,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
     @property
     def scene(self) -> Scene:
         """The training views, for measuring."""
-        return Scene.of(self.train_dataparser_outputs)
+        return Scene(self.train_dataparser_outputs)
 
     def set_effects(self, effects: Decisions) -> None:
         """Takes over what was decided, before photos are loaded: whether lenses bend rays, and whether depth is known.

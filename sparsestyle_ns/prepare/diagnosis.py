@@ -39,14 +39,12 @@ class Pair:
     """What two photos have in common.
 
     Attributes:
-        matches: features that look alike.
-        agreeing: those that agree on one geometry.
+        agreeing: matched features that agree on one geometry.
         flat: share of the agreeing ones that a homography explains.
         epipole: where the second camera lies in the first photo, as an offset from the middle in longer sides; None
             where a homography explains everything.
     """
 
-    matches: int
     agreeing: int
     flat: float
     epipole: Optional[Float[np.ndarray, "2"]]
@@ -89,18 +87,18 @@ def compare(first: Features, second: Features, shape: Sequence[int]) -> Pair:
     here, there = mutual_matches(first.descriptors, second.descriptors, MAX_RATIO)
     start, end = first.points[here], second.points[there]
     if len(start) < MIN_MATCHES:
-        return Pair(len(start), 0, 0.0, None)
+        return Pair(0, 0.0, None)
     cv2.setRNGSeed(0)  # the same photos get the same verdict
     matrix, inliers = cv2.findFundamentalMat(start, end, cv2.USAC_MAGSAC, EPIPOLAR_ERROR, 0.999, 10_000)
     if matrix is None or matrix.shape != (3, 3) or inliers.sum() < MIN_MATCHES:
-        return Pair(len(start), 0 if inliers is None else int(inliers.sum()), 0.0, None)
+        return Pair(0 if inliers is None else int(inliers.sum()), 0.0, None)
     agree = inliers.ravel() > 0
     _, explained = cv2.findHomography(start[agree], end[agree], cv2.RANSAC, FLAT_ERROR, maxIters=5_000)
     flat = 0.0 if explained is None else float(explained.mean())
     homogeneous = np.linalg.svd(matrix)[2][-1]
     middle = 0.5 * np.array([shape[1], shape[0]])
     point = homogeneous[:2] / (homogeneous[2] if abs(homogeneous[2]) > 1e-12 else 1e-12)
-    return Pair(len(start), int(agree.sum()), flat, (point - middle) / max(shape))
+    return Pair(int(agree.sum()), flat, (point - middle) / max(shape))
 
 
 def _faint(features: Sequence[Features], names: Sequence[str]) -> List[str]:
