@@ -1,7 +1,7 @@
-# Everything here sets itself up: `make demo` on a fresh clone makes the environment first, and only once.
+# Every target but help and clean first makes the environment, if there is none yet.
 #
 #   make demo PYTHON=python3.11          another Python for the environment
-#   make test VENV=/path/to/environment  an environment that exists already
+#   make test VENV=/path/to/environment  another environment, made there if need be
 #   make demo DEMO="--scene blender"     options of data_scripts/demo.py
 #   make bench BENCH="--quick --sample"  options of all benchmarks
 
@@ -12,7 +12,7 @@ BENCH ?=
 
 BIN := $(abspath $(VENV))/bin
 READY := $(VENV)/.sparsestyle-installed
-# Workers share the cores; threads inside each would only get in each other's way.
+# The workers use all cores already; more threads in each would only slow them down.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 .DEFAULT_GOAL := help
@@ -20,12 +20,12 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 help:
 	@echo "make demo   sample photos and a painting -> stylised scene, video and page in demo/index.html"
-	@echo "make test   ruff, then the tests"
-	@echo "make lint   ruff alone; 'make lint FIX=1' repairs what it can"
-	@echo "make bench  times it beside nerfstudio and the plain way; hours, table in benchmarks/results/summary.md"
+	@echo "make test   lint, then the tests"
+	@echo "make lint   ruff and import-linter; 'make lint FIX=1' repairs what it can"
+	@echo "make bench  times it beside nerfstudio and plain code; takes hours, table in benchmarks/results/summary.md"
 	@echo "make clean  removes the environment, caches and the demo"
 	@echo
-	@echo "The first of them makes an environment in $(VENV) (a few minutes, about 7 GB on a machine with CUDA wheels)."
+	@echo "Whichever runs first makes an environment in $(VENV): a few minutes, and about 7 GB with CUDA wheels."
 
 demo: $(READY)
 	$(BIN)/python data_scripts/demo.py $(DEMO)
@@ -40,6 +40,7 @@ ifdef FIX
 else
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
 endif
 
 bench: $(READY)

@@ -23,7 +23,6 @@ from torch.utils.checkpoint import checkpoint
 from benchmarks._measure import CACHE, ROOT, Options
 from sparsestyle_ns.core.occupancy import interval_lengths
 from sparsestyle_ns.core.sampling import even_edges
-from sparsestyle_ns.core.schedules import content_weight
 from sparsestyle_ns.core.spaces import Space
 from sparsestyle_ns.core.volrend import dense_weights, optical_depth
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
@@ -33,6 +32,7 @@ from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField, fine_density
+from sparsestyle_ns.losses.stylization import Losses
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
@@ -267,11 +267,11 @@ class PlainTraining:
         """One iteration: one whole view (Eq. 5)."""
         settings, pixels = self.pipeline.config, self.pipeline.datamanager.pixels
         index = self.num_steps % len(pixels.sizes)
-        view, rows = self.pipeline.views[index], slice(pixels.starts[index], pixels.starts[index + 1])
+        view, rows = self.pipeline.task.views[index], slice(pixels.starts[index], pixels.starts[index + 1])
         self.optimizer.zero_grad()
         image = self.field.render(pixels.origins[rows], pixels.directions[rows]).view(view.picture.shape)
-        style, content = self.pipeline.targets.losses(image, view.features, view.accumulation)
-        weight = content_weight(self.num_steps, settings.content_weight, settings.content_decay, settings.content_steps)
-        (style + weight * content).backward()
+        targets = self.pipeline.targets
+        values = targets.losses(targets.view(image, view.features, view.accumulation))
+        sum(Losses(values, settings.weights_at(self.num_steps)).terms().values()).backward()
         self.optimizer.step()
         self.num_steps += 1

@@ -14,10 +14,11 @@ from torch import Tensor
 from benchmarks._measure import Options, Report, check_equal, in_fresh_process, ratio_of_pairs, timed
 from benchmarks._scene import BACKBONE, find_scene, load_photos
 from sparsestyle_ns.losses.content import content_loss
-from sparsestyle_ns.losses.nnfm import StyleIndex, nnfm_loss
+from sparsestyle_ns.losses.nnfm import nnfm_loss
+from sparsestyle_ns.losses.style_index import StyleIndex
 from sparsestyle_ns.losses.stylization import feature_rows, fit_side
-from sparsestyle_ns.style.painting import load_style_image
-from sparsestyle_ns.style.vgg import load_backbone
+from sparsestyle_ns.style.backbones import load_backbone
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import exit_on_input_error
 from sparsestyle_ns.utils.machine import peak_bytes
 
@@ -84,7 +85,7 @@ def features_of_scene(options: Options, device: torch.device) -> Tuple[Tensor, T
     backbone = load_backbone(BACKBONE).to(device)
     photos = load_photos(scene, PHOTO_SIDE // shrink).train_dataset
     pictures = [photos[index]["image"][..., :3].permute(2, 0, 1)[None] for index in (0, 1)]
-    pictures.insert(1, fit_side(load_style_image(scene.style_image)[None], STYLE_SIDE // shrink))
+    pictures.insert(1, fit_side(Painting.read(scene.style_image).pixels[None], STYLE_SIDE // shrink))
     view, style, content = (feature_rows(backbone(picture.to(device))) for picture in pictures)
     return view, style, content
 

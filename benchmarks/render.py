@@ -25,8 +25,8 @@ from benchmarks._scene import (
 )
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.metrics.image import psnr
-from sparsestyle_ns.models.hier_style import RenderMode
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
+from sparsestyle_ns.rendering.look import RenderMode
 from sparsestyle_ns.utils.errors import exit_on_input_error
 
 SIDE = 252

@@ -63,14 +63,14 @@ def measure_costs(config: Any, coarse: CoarseRun, report: Report) -> Dict[str, A
     work = {
         "step": training.step,
         "render": lambda: pipeline.model.get_outputs_for_camera(camera),
-        "prepare": pipeline.prepare_views,
+        "prepare": pipeline.freeze_views,
     }
     measures = {name: timed(function, report.device) for name, function in work.items()}
     found = alternate(measures, report.options.repetitions(3))
     seconds: Dict[str, Any] = {name: [one.seconds for one in durations] for name, durations in found.items()}
     return {
         "pixels": math.prod(pipeline.datamanager.pixels.sizes[0]),
-        "kept_bytes": sum(view.frozen.kept_bytes for view in pipeline.views),
+        "kept_bytes": sum(view.frozen.kept_bytes for view in pipeline.task.views),
         "seconds": seconds,
     }
 

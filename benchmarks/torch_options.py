@@ -22,9 +22,11 @@ from sparsestyle_ns.core.precision import Precision, autocast
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
-from sparsestyle_ns.losses.nnfm import CHUNK_SIZE, StyleIndex
+from sparsestyle_ns.losses.nnfm import CHUNK_SIZE
+from sparsestyle_ns.losses.style_index import StyleIndex
 from sparsestyle_ns.losses.stylization import feature_rows
-from sparsestyle_ns.style.vgg import VGGFeatures, load_backbone
+from sparsestyle_ns.style.backbones import load_backbone
+from sparsestyle_ns.style.vgg import VGGFeatures
 from sparsestyle_ns.utils.errors import exit_on_input_error
 
 USUAL, EXACT = "as it is", "float32"

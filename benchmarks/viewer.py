@@ -124,7 +124,7 @@ def main(options: RenderOptions) -> None:
             with torch.no_grad():
                 other.color_head.weight.neg_()
             panel.styles.append(Style("other", other))
-            panel._offer_styles(panel.styles[0].name)
+            panel.offer_styles(panel.styles[0].name)
             panel.other.value = "other"
             screen.draw(flight[1])
             look("baked, two styles blended", at_rest, panel.blend)

@@ -8,14 +8,25 @@ The example data holds only lego. With `--url`, any zip archive that holds a fol
 `transforms_train.json` in it will do.
 """
 
-import argparse
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Callable, Optional, Sequence
+from typing import Optional, Sequence
 
 import imageio.v2 as imageio
 import numpy as np
-from _download import FetchError, add_common_arguments, run
+from _command_line import ScriptError, parse
+from _download import FetchOptions, run
+
+
+@dataclass(frozen=True)
+class BlenderOptions(FetchOptions):
+    """The options of this script."""
+
+    scene: str = "lego"
+    """Name of the scene's folder, in the archive as in OUTPUT."""
+    half_resolution: bool = False
+    """Halve the pictures: 800 x 800 -> 400 x 400."""
 
 
 def halve_image(image: np.ndarray) -> np.ndarray:
@@ -54,27 +65,21 @@ def halve_scene(folder: Path) -> None:
     """Halves every PNG picture below `folder`, in place. The camera angles in the JSON files stay true.
 
     Raises:
-        FetchError: If a picture cannot be read or halved.
+        ScriptError: A picture cannot be read or halved.
     """
     for path in sorted(folder.rglob("*.png")):
         try:
             halved = halve_image(np.asarray(imageio.imread(path)))
         except (OSError, ValueError, SyntaxError) as error:
             name = path.relative_to(folder)
-            raise FetchError(f"Cannot halve {name} ({error}); leave out --half-resolution.") from error
+            raise ScriptError(f"Cannot halve {name} ({error}); leave out --half-resolution.") from error
         imageio.imwrite(path, halved)
 
 
 def main(arguments: Optional[Sequence[str]] = None) -> int:
     """The command line; `arguments` default to the process's own. Returns the exit status."""
-    parser = argparse.ArgumentParser(description="Fetches a synthetic scene in NeRF's Blender layout.")
-    add_common_arguments(parser, default_scene="lego")
-    parser.add_argument("--half-resolution", action="store_true", help="halve the pictures: 800 x 800 -> 400 x 400")
-
-    def finish_of(options: argparse.Namespace) -> Optional[Callable[[Path], None]]:
-        return halve_scene if options.half_resolution else None
-
-    return run(parser, "transforms_train.json", "blender-data", arguments, finish_of)
+    options = parse(BlenderOptions, __doc__, arguments)
+    return run(options, "transforms_train.json", "blender-data", halve_scene if options.half_resolution else None)
 
 
 if __name__ == "__main__":

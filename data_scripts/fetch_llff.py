@@ -7,18 +7,16 @@ The example data holds only fern. With `--url`, any zip archive that holds a fol
 `poses_bounds.npy` in it will do.
 """
 
-import argparse
 import sys
 from typing import Optional, Sequence
 
-from _download import add_common_arguments, run
+from _command_line import parse
+from _download import FetchOptions, run
 
 
 def main(arguments: Optional[Sequence[str]] = None) -> int:
     """The command line; `arguments` default to the process's own. Returns the exit status."""
-    parser = argparse.ArgumentParser(description="Fetches a forward-facing scene in the LLFF layout.")
-    add_common_arguments(parser, default_scene="fern")
-    return run(parser, "poses_bounds.npy", "llff-data", arguments)
+    return run(parse(FetchOptions, __doc__, arguments), "poses_bounds.npy", "llff-data")
 
 
 if __name__ == "__main__":

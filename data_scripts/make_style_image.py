@@ -5,32 +5,28 @@ furrowed fields and a dark tree. The same size, seed and palette give the same p
 
     python data_scripts/make_style_image.py OUTPUT.png
     python data_scripts/make_style_image.py OUTPUT.png --size 768 --palette harvest --seed 3
-
-The picture is painted in layers, each with finer strokes than the last. A stroke is a short curve along the flow, and
-consists of bristles: thin parallel lines of slightly different tone that also leave a relief of paint. Light from the
-upper left on that relief is what makes the strokes stand out.
 """
 
-import argparse
 import math
-import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Optional, Sequence
+from typing import Annotated, Optional, Sequence
 
 import cv2
 import numpy as np
+import tyro
+from _command_line import ScriptError, check_ranges, exit_status, parse, print_made
 
 SUBPIXEL_BITS = 4
 """OpenCV draws lines with end points in units of 1 / 2^SUBPIXEL_BITS pixel."""
 THICKEST_PAINT = 150
-"""What the relief, a picture of bytes since OpenCV smooths no other lines, calls a thickness of 1."""
+"""A thickness of 1 in the relief, which holds bytes because OpenCV draws smooth lines into nothing else."""
 
 
 @dataclass(frozen=True)
 class Palette:
-    """The tubes of paint: '#rrggbb' codes for every part of the picture."""
+    """Paints for every part of the picture, as '#rrggbb'."""
 
     sky: tuple[str, ...]
     """From the horizon up."""
@@ -41,7 +37,7 @@ class Palette:
     field: tuple[str, ...]
     """The furrows, in turn."""
     tree: tuple[str, ...]
-    """Its tongues, in turn."""
+    """Its flames, in turn."""
     ground: str
     """The canvas's first coat, which shows between strokes."""
 
@@ -95,7 +91,7 @@ class Layer:
     bristles: int
     """Lines in a stroke."""
     contrast: float
-    """How far tones stray from the tube's colour, in [0, 1]."""
+    """How far tones stray from the paint's colour, in [0, 1]."""
 
 
 LAYERS = (
@@ -106,7 +102,10 @@ LAYERS = (
 
 
 def paint(size: int = 512, seed: int = 0, palette: str = "night") -> np.ndarray:
-    """Paints the picture.
+    """Paints the picture, in layers of ever finer strokes.
+
+    A stroke is a short curve along the flow, and consists of bristles: thin parallel lines of slightly different tone
+    that also leave a relief of paint. Light from the upper left on that relief makes the strokes stand out.
 
     Args:
         size: Rows; there are 5 columns for every 4 rows.
@@ -126,7 +125,7 @@ def paint(size: int = 512, seed: int = 0, palette: str = "night") -> np.ndarray:
     rng = np.random.default_rng(seed)
     height, width = size, round(1.25 * size)
     colours, flow = compose(height, width, rng, PALETTES[palette])
-    canvas = np.full((height, width, 3), _rgb(PALETTES[palette].ground), np.uint8)
+    canvas = np.full((height, width, 3), _paints([PALETTES[palette].ground])[0], np.uint8)
     relief = np.zeros((height, width), np.uint8)
     for layer in LAYERS:
         _paint_layer(canvas, relief, colours, flow, layer, rng)
@@ -149,13 +148,14 @@ def compose(height: int, width: int, rng: np.random.Generator, palette: Palette)
         Colours (height, width, 3) float32 in [0, 255], and unit vectors (height, width, 2), x first, y down.
     """
     y, x = np.mgrid[0:height, 0:width].astype(np.float32) / height
-    sun = np.array([rng.uniform(0.85, 1.05), rng.uniform(0.17, 0.25)])
+    sun = (rng.uniform(0.85, 1.05), rng.uniform(0.17, 0.25))
     whirls = [
         (rng.uniform(0.42, 0.58), rng.uniform(0.28, 0.36), 0.17, 1.0),
         (rng.uniform(0.72, 0.84), rng.uniform(0.46, 0.52), 0.10, -1.0),
         (rng.uniform(0.12, 0.22), rng.uniform(0.12, 0.2), 0.12, -1.0),
     ]
-    colours, flow = _sky(x, y, sun, whirls, palette, rng)
+    colours, flow = _sky(x, y, whirls, palette, rng)
+    _add_sun(colours, flow, x, y, sun, palette)
     _add_land(colours, flow, x, y, palette, rng)
     _add_tree(colours, flow, x, y, rng.uniform(0.16, 0.24), palette)
     flow /= np.maximum(np.linalg.norm(flow, axis=-1, keepdims=True), 1e-6)
@@ -163,14 +163,9 @@ def compose(height: int, width: int, rng: np.random.Generator, palette: Palette)
 
 
 def _sky(
-    x: np.ndarray,
-    y: np.ndarray,
-    sun: np.ndarray,
-    whirls: Sequence[tuple[float, float, float, float]],
-    palette: Palette,
-    rng: np.random.Generator,
+    x: np.ndarray, y: np.ndarray, whirls: Sequence[tuple[float, ...]], palette: Palette, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bands of sky dragged around whirls (x, y, radius, sense), and a sun with halos: colours and flow."""
+    """Colours and flow of a banded sky, dragged around whirls (x, y, radius, 1 clockwise or -1 against it)."""
     phase = rng.uniform(0, 2 * math.pi, 2)
     flow = np.stack([np.ones_like(x), 0.45 * np.cos(5 * x + phase[0]) + 0.2 * np.sin(9 * y + phase[1])], axis=-1)
     tone = (0.62 - y) / 0.62 + 0.12 * np.sin(4.2 * x + phase[0]) + 0.07 * np.sin(13 * y + 3 * x)
@@ -178,21 +173,31 @@ def _sky(
         dx, dy = x - centre_x, y - centre_y
         distance = np.hypot(dx, dy)
         pull = np.exp(-((distance / radius) ** 2))
-        around = np.stack([-dy, dx], axis=-1) * sense / np.maximum(distance, 1e-4)[..., None]
-        flow = flow * (1 - pull[..., None]) + 2.2 * pull[..., None] * around
+        _turn_flow(flow, dx, dy, pull, 2.2, sense)
         spiral = np.sin(np.arctan2(dy, dx) * 2 * sense + distance / radius * 8)
         tone = tone * (1 - 0.55 * pull) + pull * (0.15 + 0.45 * spiral)
     steps = np.clip(tone * len(palette.sky), 0, len(palette.sky) - 1).astype(int)
-    colours = _paints(palette.sky)[steps]
+    return _paints(palette.sky)[steps], flow
 
+
+def _add_sun(
+    colours: np.ndarray, flow: np.ndarray, x: np.ndarray, y: np.ndarray, sun: tuple[float, float], palette: Palette
+) -> None:
+    """A sun with halos, which the flow goes around; in place."""
     dx, dy = x - sun[0], y - sun[1]
     distance = np.hypot(dx, dy)
-    rings = _paints(palette.light)[np.clip(distance / 0.045, 0, len(palette.light) - 1).astype(int)]
+    rings = np.clip(distance / 0.045, 0, len(palette.light) - 1).astype(int)
     is_halo = (distance < 0.14) | ((distance < 0.27) & (np.sin(distance * 90) > 0.1))
-    colours = np.where(is_halo[..., None], rings, colours)
-    pull = np.clip(1.6 - distance / 0.19, 0, 1)[..., None]
-    around = np.stack([-dy, dx], axis=-1) / np.maximum(distance, 1e-4)[..., None]
-    return colours, flow * (1 - pull) + 2.0 * pull * around
+    colours[is_halo] = _paints(palette.light)[rings[is_halo]]
+    _turn_flow(flow, dx, dy, np.clip(1.6 - distance / 0.19, 0, 1), 2.0)
+
+
+def _turn_flow(
+    flow: np.ndarray, dx: np.ndarray, dy: np.ndarray, pull: np.ndarray, speed: float, sense: float = 1.0
+) -> None:
+    """Bends the flow around the point from which pixels are (dx, dy) away, by a share `pull` in [0, 1]; in place."""
+    around = np.stack([-dy, dx], axis=-1) * sense / np.maximum(np.hypot(dx, dy), 1e-4)[..., None]
+    flow[:] = flow * (1 - pull[..., None]) + speed * pull[..., None] * around
 
 
 def _add_land(
@@ -223,7 +228,7 @@ def _add_land(
 def _add_tree(
     colours: np.ndarray, flow: np.ndarray, x: np.ndarray, y: np.ndarray, root: float, palette: Palette
 ) -> None:
-    """A tree like a flame, from the lower edge up into the sky; in place."""
+    """A flame-shaped tree, from the lower edge up into the sky; in place."""
     up = np.clip((1.02 - y) / 0.92, 0, 1)
     lean = root + 0.03 * np.sin(6.5 * up) * up
     half_width = 0.15 * np.sqrt(np.clip(1 - up, 0, 1)) * (0.75 + 0.35 * np.sin(4.5 * up + 0.6))
@@ -337,42 +342,58 @@ def _light_on_relief(relief: np.ndarray, size: int) -> np.ndarray:
     return 1 + 0.30 * np.tanh(slope * 0.9)
 
 
-def _rgb(hex_code: str) -> np.ndarray:
-    """'#rrggbb' -> (3,) float32 in [0, 255]."""
-    return np.array([int(hex_code[i : i + 2], 16) for i in (1, 3, 5)], np.float32)
-
-
 def _paints(hex_codes: Sequence[str]) -> np.ndarray:
     """K codes '#rrggbb' -> (K, 3) float32 in [0, 255]."""
-    return np.stack([_rgb(code) for code in hex_codes])
+    return np.array([list(bytes.fromhex(code[1:])) for code in hex_codes], np.float32)
 
 
 # ---------------------------------------------------------------------------------------------------- command line
 
 
-def main(arguments: Optional[Sequence[str]] = None) -> int:
-    """The command line; `arguments` default to the process's own. Returns the exit status."""
-    parser = argparse.ArgumentParser(description="Paints a style image in thick strokes.")
-    parser.add_argument("output", type=Path, help="picture to write, .png or .jpg")
-    parser.add_argument("--size", type=int, default=512, help="rows of the picture, at least 64")
-    parser.add_argument("--seed", type=int, default=0, help="which arrangement")
-    parser.add_argument("--palette", choices=tuple(PALETTES), default="night", help="which paints")
-    options = parser.parse_args(arguments)
-    if options.seed < 0:
-        parser.error(f"--seed is {options.seed}, but has to be at least 0")
-    if options.output.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        parser.error(f"OUTPUT is {options.output}, but has to end in .png or .jpg")
+@dataclass(frozen=True)
+class Options:
+    """The command line; the docstrings are its help."""
+
+    output: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUTPUT")]
+    """Picture to write, .png or .jpg."""
+    size: int = 512
+    """Rows of the picture, at least 64; there are 5 columns for every 4 rows."""
+    seed: int = 0
+    """Which arrangement of whirls, hills and strokes."""
+    palette: tyro.extras.literal_type_from_choices(PALETTES) = "night"
+    """Which paints."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, seed=(0, math.inf))
+        if self.output.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+            raise ValueError(f"OUTPUT is {self.output}, but has to end in .png or .jpg")
+
+
+def write_picture(options: Options) -> None:
+    """Paints a picture and writes it.
+
+    Raises:
+        ScriptError: It is too small to be painted, or cannot be written.
+    """
     try:
         picture = paint(options.size, options.seed, options.palette)
         options.output.parent.mkdir(parents=True, exist_ok=True)
         _, encoded = cv2.imencode(options.output.suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         options.output.write_bytes(encoded.tobytes())
-    except (OSError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
-    command = ["ns-train", "hier-style", "--style-image", str(options.output), "--data", "SCENE", "llff-data"]
-    print(f"Made {options.output} – next: {shlex.join(command)}")
-    return 0
+    except ValueError as error:
+        raise ScriptError(str(error)) from error
+    except OSError as error:
+        raise ScriptError(
+            f"Cannot write {options.output}: {error.strerror or error}; choose another OUTPUT."
+        ) from error
+    command = ["ns-train", "hier-style", "--style-image", options.output, "--data", "SCENE", "llff-data"]
+    print_made(options.output, command)
+
+
+def main(arguments: Optional[Sequence[str]] = None) -> int:
+    """The command line; `arguments` default to the process's own. Returns the exit status."""
+    options = parse(Options, __doc__, arguments)
+    return exit_status(lambda: write_picture(options))
 
 
 if __name__ == "__main__":

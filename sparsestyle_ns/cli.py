@@ -98,11 +98,11 @@ def evaluate(
     path = output_path or config.parent / REPORT_FILE
     prepare_output(path, "The report", "report.json")  # measuring takes minutes, so what can fail fails before
     if style_image is not None:
-        from sparsestyle_ns.style.painting import load_style_image
+        from sparsestyle_ns.style.painting import Painting
 
-        load_style_image(style_image)
+        Painting.read(style_image)
     from sparsestyle_ns.engine.hints import after_evaluation, finish
-    from sparsestyle_ns.evaluation.held_out import evaluate_run
+    from sparsestyle_ns.engine.loading import evaluate_run
     from sparsestyle_ns.evaluation.tables import report_tables
 
     report = evaluate_run(config, path, style_image, baked)
@@ -290,7 +290,7 @@ def _write_study(
     from sparsestyle_ns.studies.experiments import Laboratory, SceneSettings
     from sparsestyle_ns.studies.study import Study
     from sparsestyle_ns.studies.study_page import write_study
-    from sparsestyle_ns.style.painting import load_style_image
+    from sparsestyle_ns.style.painting import Painting
     from sparsestyle_ns.utils.page import prepare_page
 
     check_parser(options.parser)
@@ -301,7 +301,7 @@ def _write_study(
     if options.jobs is not None and options.jobs < 1:
         raise InputError(f"--jobs is {options.jobs}; at least one run at a time is needed.")
     for painting in options.style_images:
-        load_style_image(painting)
+        Painting.read(painting)
     prepare_page(options.output_path)
     side = options.max_image_side
     scene = SceneSettings(

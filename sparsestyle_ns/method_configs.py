@@ -5,18 +5,17 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig, MultiS
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from sparsestyle_ns.engine.trainer import (
-    CoarseFewShotTrainer,
-    FusedAdamConfig,
-    HierStyleTrainer,
-    HierStyleTrainerConfig,
-    SparseStyleTrainerConfig,
-)
+from sparsestyle_ns.engine.coarse_trainer import CoarseFewShotTrainer
+from sparsestyle_ns.engine.optimizers import FusedAdamConfig
+from sparsestyle_ns.engine.style_trainer import HierStyleTrainer, HierStyleTrainerConfig
+from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
 from sparsestyle_ns.models.hier_style import HierStyleModelConfig
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
+from sparsestyle_ns.viewer.effects_panel import EffectsPanel
+from sparsestyle_ns.viewer.panel import StylePanel
 
 
 def _logging(steps_per_log: int) -> LoggingConfig:
@@ -42,6 +41,7 @@ def _coarse_fewshot(draft: bool) -> TrainerConfig:
                 max_image_side=128 if draft else 1008,
             ),
             model=CoarseFewShotModelConfig(num_eval_samples=32 if draft else 64),
+            panel=EffectsPanel,
         ),
         optimizers={
             "fields": {
@@ -55,10 +55,19 @@ def _coarse_fewshot(draft: bool) -> TrainerConfig:
     )
 
 
+def _coarse_fewshot_full() -> TrainerConfig:
+    return _coarse_fewshot(draft=False)
+
+
+def _coarse_fewshot_draft() -> TrainerConfig:
+    return _coarse_fewshot(draft=True)
+
+
 def _hier_style(draft: bool) -> TrainerConfig:
     """Stage 2; the draft is for images of about 128 pixels and two CPU cores."""
     return HierStyleTrainerConfig(
         _target=HierStyleTrainer,
+        coarse_method=_coarse_fewshot_draft if draft else _coarse_fewshot_full,
         method_name="hier-style-draft" if draft else "hier-style",
         max_num_iterations=200,
         steps_per_save=50,
@@ -79,6 +88,7 @@ def _hier_style(draft: bool) -> TrainerConfig:
             else HierStyleModelConfig(),
             feature_side=252 if draft else 504,
             warm_start_steps=40 if draft else 60,
+            panel=StylePanel,
         ),
         optimizers={
             "fields": {

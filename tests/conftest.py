@@ -74,7 +74,8 @@ def coarse_pipeline(scene: Path, **settings: Any) -> "CoarseFewShotPipeline":
 
     from sparsestyle_ns.data.llff import LLFFDataParserConfig
     from sparsestyle_ns.effects.base import EffectSettings
-    from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig, CoarseFieldConfig
+    from sparsestyle_ns.fields.coarse import CoarseFieldConfig
+    from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
     from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
     from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 
@@ -154,7 +155,7 @@ def runs(llff_scene: Path, painting: Path, tmp_path_factory: pytest.TempPathFact
 @pytest.fixture(scope="session")
 def patterned_run(runs: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The stylised run, which a few iterations left grey all over, with weights that make shapes and colours."""
-    from sparsestyle_ns.runs.coarse_run import newest_checkpoint
+    from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 
     outputs = tmp_path_factory.mktemp("outputs")
     folder = shutil.copytree(runs.style, outputs / "scene" / "hier-style" / "run")

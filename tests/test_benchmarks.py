@@ -23,6 +23,7 @@ from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.losses.nnfm import nnfm_loss
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.rendering.render import freeze_samples, render_stylised
+from sparsestyle_ns.rendering.visible_samples import Marching
 from sparsestyle_ns.utils import machine
 from sparsestyle_ns.utils.errors import InputError
 
@@ -261,15 +262,8 @@ def test_the_plain_way_gives_the_picture_and_the_gradients_that_ours_gives(space
     origins = 3 * torch.nn.functional.normalize(torch.randn(20, 3), dim=-1)
     directions = torch.nn.functional.normalize(torch.rand(20, 3) - 0.5 - origins, dim=-1)
 
-    frozen = freeze_samples(
-        coarse,
-        residual,
-        Occupancy(4),
-        space.segments(origins, directions),
-        _scene.PLAIN_SAMPLES,
-        space.unbounded,
-        min_transmittance=0.0,
-    )
+    marching = Marching(Occupancy(4), _scene.PLAIN_SAMPLES, space.unbounded, min_transmittance=0.0)
+    frozen = freeze_samples(coarse, residual, space.segments(origins, directions), marching)
     ours = render_stylised(residual, frozen, color).rgb
     monkeypatch.setattr(_scene, "PLAIN_RAYS_PER_CHUNK", 7)
     plain_field = _scene.PlainField(coarse, residual, space, color)

@@ -20,13 +20,14 @@ import torch
 import yaml
 from conftest import TINY, TINY_STYLE, ns_train, only_run, run_entrypoint
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.trainer import Trainer
 from scipy.spatial.transform import Rotation
 
 from sparsestyle_ns.effects.registry import EFFECTS
+from sparsestyle_ns.engine.trainer import SparseStyleTrainer
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
-from sparsestyle_ns.runs.coarse_run import newest_checkpoint, read_coarse_run
+from sparsestyle_ns.runs.checkpoints import newest_checkpoint
+from sparsestyle_ns.runs.coarse_run import read_coarse_run
 from sparsestyle_ns.style import vgg
 
 METHODS = ("coarse-fewshot", "coarse-fewshot-draft", "hier-style", "hier-style-draft")
@@ -47,14 +48,14 @@ def render(subcommand: str, run: Path, output: Path, *flags: str) -> None:
 
 def press_ctrl_c_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
     """Has the user press Ctrl-C in the middle of an iteration."""
-    train_iteration = Trainer.train_iteration
+    train_iteration = SparseStyleTrainer.train_iteration
 
-    def press(trainer: Trainer, current: int):
+    def press(trainer: SparseStyleTrainer, current: int):
         if current == step:
             signal.raise_signal(signal.SIGINT)
         return train_iteration(trainer, current)
 
-    monkeypatch.setattr(Trainer, "train_iteration", press)
+    monkeypatch.setattr(SparseStyleTrainer, "train_iteration", press)
 
 
 def assert_same_state(first: dict, second: dict) -> None:
@@ -96,7 +97,7 @@ def test_the_defaults_are_the_papers() -> None:
     assert (optimizer.lr, optimizer.betas) == (5e-3, (0.9, 0.999))
     assert (scheduler.gamma, scheduler.milestones) == (0.33, (50, 100))
     settings, model = style.pipeline, style.pipeline.model
-    assert (settings.content_weight, settings.content_decay, settings.content_steps) == (10.0, 0.01, 100)
+    assert (settings.loss_weights["content"], settings.content_decay, settings.content_steps) == (10.0, 0.01, 100)
     assert (model.hash_levels, model.min_resolution, model.max_resolution) == (8, 128, 512)
     assert (model.features_per_level, model.log2_table_size) == (4, 19)
     assert (model.hidden_layers, model.layer_width) == (2, 256)
@@ -137,9 +138,8 @@ def test_a_stylised_run_renders_without_painting_weights_and_coarse_run(
     def refuse(*args: object) -> None:
         raise AssertionError("rendering asked for the painting or the feature network")
 
-    monkeypatch.setattr(pipeline, "load_style_image", refuse)
+    monkeypatch.setattr(pipeline.Painting, "read", refuse)
     monkeypatch.setattr(base, "load_backbone", refuse)
-    monkeypatch.setattr(pipeline.HierStylePipelineConfig, "load_targets", refuse)
     hidden = runs.coarse.rename(runs.coarse.parent / "hidden")
     try:
         names = ["rgb", "rgb_coarse", "depth", "accumulation"]

@@ -5,9 +5,12 @@ import json
 import os
 import shlex
 
+import _stages
 import numpy as np
 import pytest
 import torch
+from _flight import camera_path, ellipse_path, flight, orbit_path
+from _stages import Stage, StageFailedError, run_command, run_stages, without_config
 from nerfstudio.cameras.camera_paths import get_path_from_json
 from PIL import Image
 
@@ -24,7 +27,7 @@ def forward_facing_poses():
 
 def read_path(poses, size=(252, 189), focal_over_height=1.0):
     """What ns-render makes of a camera path that went through a file."""
-    return get_path_from_json(json.loads(json.dumps(demo.camera_path(poses, size, focal_over_height))))
+    return get_path_from_json(json.loads(json.dumps(camera_path(poses, size, focal_over_height))))
 
 
 def seen_at(cameras, point):
@@ -37,7 +40,7 @@ def seen_at(cameras, point):
 
 
 def test_ellipse_keeps_the_focus_in_the_middle_of_every_frame():
-    cameras = read_path(demo.ellipse_path(forward_facing_poses(), focus_distance=3.0, frames=12))
+    cameras = read_path(ellipse_path(forward_facing_poses(), focus_distance=3.0, frames=12))
     assert cameras.size == 12
     middle = torch.tensor([126.0, 94.0]).expand(12, 2)
     torch.testing.assert_close(seen_at(cameras, (0.0, 0.0, -3.0)), middle, atol=1e-3, rtol=0)
@@ -45,27 +48,27 @@ def test_ellipse_keeps_the_focus_in_the_middle_of_every_frame():
 
 def test_ellipse_is_as_wide_and_high_as_the_photos_spread():
     poses = forward_facing_poses()
-    positions = demo.ellipse_path(poses, focus_distance=1.0, frames=4)[:, :3, 3]
+    positions = ellipse_path(poses, focus_distance=1.0, frames=4)[:, :3, 3]
     spread = np.sqrt((poses[:, :3, 3] ** 2).mean(0))
     expected = [(spread[0], 0, 0), (0, spread[1], 0), (-spread[0], 0, 0), (0, -spread[1], 0)]
     np.testing.assert_allclose(positions, expected, atol=1e-12)
 
 
 def test_ellipse_moves_even_where_all_photos_were_taken_from_one_spot():
-    positions = demo.ellipse_path(np.tile(np.eye(4), (3, 1, 1)), focus_distance=2.0, frames=8)[:, :3, 3]
+    positions = ellipse_path(np.tile(np.eye(4), (3, 1, 1)), focus_distance=2.0, frames=8)[:, :3, 3]
     np.testing.assert_allclose(np.linalg.norm(positions, axis=-1), 0.06)
 
 
 def test_ellipse_follows_the_cameras_into_any_direction():
     turn = np.array([[0.0, 0, 1, 4], [1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 0, 1]])
-    straight = demo.ellipse_path(forward_facing_poses(), 3.0, 6)
-    np.testing.assert_allclose(demo.ellipse_path(turn @ forward_facing_poses(), 3.0, 6), turn @ straight, atol=1e-12)
+    straight = ellipse_path(forward_facing_poses(), 3.0, 6)
+    np.testing.assert_allclose(ellipse_path(turn @ forward_facing_poses(), 3.0, 6), turn @ straight, atol=1e-12)
 
 
 def test_orbit_goes_all_around_at_the_photos_height_and_looks_at_the_origin():
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, 3] = [(3, 0, 2), (0, 3, 2), (-3, 0, 2), (0, -3, 2)]
-    path = demo.orbit_path(poses, 8)
+    path = orbit_path(poses, 8)
     np.testing.assert_allclose(path[:, 2, 3], 2.0)
     np.testing.assert_allclose(np.linalg.norm(path[:, :3, 3], axis=-1), np.sqrt(13))
     assert np.allclose(path[:, :3, 3].mean(0), (0, 0, 2))
@@ -75,7 +78,7 @@ def test_orbit_goes_all_around_at_the_photos_height_and_looks_at_the_origin():
 
 @pytest.mark.parametrize(
     "path",
-    [demo.ellipse_path(forward_facing_poses(), 3.0, 5), demo.orbit_path(forward_facing_poses()[1:], 5)],
+    [ellipse_path(forward_facing_poses(), 3.0, 5), orbit_path(forward_facing_poses()[1:], 5)],
     ids=["ellipse", "orbit"],
 )
 def test_poses_are_rotations(path):
@@ -85,7 +88,7 @@ def test_poses_are_rotations(path):
 
 
 def test_camera_path_has_the_photos_lens_and_even_sides():
-    path = demo.camera_path(np.eye(4)[None], (253, 189), focal_over_height=0.85)
+    path = camera_path(np.eye(4)[None], (253, 189), focal_over_height=0.85)
     assert (path["render_width"], path["render_height"]) == (252, 188)
     cameras = get_path_from_json(path)
     assert cameras.fx.item() == pytest.approx(0.85 * 188)
@@ -96,7 +99,7 @@ def test_flight_before_an_llff_scene_is_in_nerfstudios_world(tmp_path):
     row = np.concatenate([np.c_[np.eye(3), np.zeros(3), (189.0, 252.0, 214.2)].ravel(), (2.0, 8.0)])
     np.save(tmp_path / "poses_bounds.npy", np.tile(row, (3, 1)))
     (tmp_path / "scene.json").write_text(json.dumps({"cameras": forward_facing_poses()[:, :3].tolist()}))
-    cameras = get_path_from_json(demo.flight("llff", tmp_path, tmp_path, frames=6, longer_side=252))
+    cameras = get_path_from_json(flight("llff", tmp_path, tmp_path, frames=6, longer_side=252))
     # 1 / (0.25 / 2 + 0.75 / 8) of the file's units, in which the near bound of 2 is 4/3 in nerfstudio's world
     focus = (0.0, 0.0, -32 / 7 * (4 / 3) / 2)
     torch.testing.assert_close(seen_at(cameras, focus), torch.tensor([[126.0, 94.0]]).expand(6, 2), atol=1e-3, rtol=0)
@@ -107,9 +110,9 @@ def test_flight_around_a_blender_scene_has_its_pictures_shape_and_angle(tmp_path
     (tmp_path / "train").mkdir()
     Image.new("RGBA", (60, 40)).save(tmp_path / "train" / "r_0.png")
     (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": np.pi / 2}))
-    poses = demo.orbit_path(forward_facing_poses()[1:], 3)
+    poses = orbit_path(forward_facing_poses()[1:], 3)
     (tmp_path / "scene.json").write_text(json.dumps({"cameras": poses[:, :3].tolist()}))
-    path = demo.flight("blender", tmp_path, tmp_path, frames=4, longer_side=30)
+    path = flight("blender", tmp_path, tmp_path, frames=4, longer_side=30)
     assert (path["render_width"], path["render_height"]) == (30, 20)
     assert get_path_from_json(path).fx[0].item() == pytest.approx(15.0)
 
@@ -117,7 +120,7 @@ def test_flight_around_a_blender_scene_has_its_pictures_shape_and_angle(tmp_path
 def append(folder, name):
     """A stage that adds a line to a file, so that one can count how often it ran."""
     code = f"open({str(folder / name)!r}, 'a').write('ran\\n')"
-    return demo.Stage(name, f"Writing {name}", [["python", "-c", code]], name)
+    return Stage(name, f"Writing {name}", [["python", "-c", code]], name)
 
 
 def times_run(folder):
@@ -126,57 +129,57 @@ def times_run(folder):
 
 def test_finished_stages_are_not_done_again(tmp_path, capsys):
     stages = [append(tmp_path, "first"), append(tmp_path, "second")]
-    demo.Demo(tmp_path).run(stages)
-    demo.Demo(tmp_path).run(stages)
+    run_stages(tmp_path, stages)
+    run_stages(tmp_path, stages)
     assert times_run(tmp_path) == {"first": 1, "second": 1}
     assert capsys.readouterr().out.count("done before") == 2
 
 
 def test_force_does_all_again(tmp_path):
     stages = [append(tmp_path, "first"), append(tmp_path, "second")]
-    demo.Demo(tmp_path).run(stages)
-    demo.Demo(tmp_path, force=True).run(stages)
+    run_stages(tmp_path, stages)
+    run_stages(tmp_path, stages, force=True)
     assert times_run(tmp_path) == {"first": 2, "second": 2}
 
 
 def test_changed_settings_and_all_that_follows_are_done_again(tmp_path):
     first, second, third = (append(tmp_path, name) for name in ("first", "second", "third"))
-    demo.Demo(tmp_path).run([first, second, third])
+    run_stages(tmp_path, [first, second, third])
     second.settings = "48 frames"
-    demo.Demo(tmp_path).run([first, second, third])
+    run_stages(tmp_path, [first, second, third])
     assert times_run(tmp_path) == {"first": 1, "second": 2, "third": 2}
 
 
 def test_stage_whose_product_is_gone_is_done_again(tmp_path):
     stages = [append(tmp_path, "first"), append(tmp_path, "second")]
-    demo.Demo(tmp_path).run(stages)
+    run_stages(tmp_path, stages)
     (tmp_path / "first").unlink()
-    demo.Demo(tmp_path).run(stages)
+    run_stages(tmp_path, stages)
     assert times_run(tmp_path) == {"first": 1, "second": 2}
 
 
 def test_failed_stage_ends_with_its_last_lines_and_is_done_again(tmp_path):
     code = "import sys; [print(f'line {i}') for i in range(30)]; sys.exit(3)"
-    failing = demo.Stage("second", "Failing", [["python", "-c", code]], "second")
-    with pytest.raises(demo.StageFailedError) as failure:
-        demo.Demo(tmp_path).run([append(tmp_path, "first"), failing])
+    failing = Stage("second", "Failing", [["python", "-c", code]], "second")
+    with pytest.raises(StageFailedError) as failure:
+        run_stages(tmp_path, [append(tmp_path, "first"), failing])
     lines = str(failure.value).splitlines()
     assert lines[0] == "Failing: python ended with exit status 3; its last lines were"
     assert [line.strip() for line in lines[1:]] == [f"line {i}" for i in range(10, 30)]
-    demo.Demo(tmp_path).run([append(tmp_path, "first"), append(tmp_path, "second")])
+    run_stages(tmp_path, [append(tmp_path, "first"), append(tmp_path, "second")])
     assert times_run(tmp_path) == {"first": 1, "second": 1}
 
 
 def test_stage_that_makes_nothing_fails(tmp_path):
-    idle = demo.Stage("idle", "Doing nothing", [["python", "-c", "pass"]], "something")
-    with pytest.raises(demo.StageFailedError, match=r"Doing nothing: it ended without .*something"):
-        demo.Demo(tmp_path).run([idle])
+    idle = Stage("idle", "Doing nothing", [["python", "-c", "pass"]], "something")
+    with pytest.raises(StageFailedError, match=r"Doing nothing: it ended without .*something"):
+        run_stages(tmp_path, [idle])
 
 
 def test_program_that_is_missing_is_named(tmp_path):
-    missing = demo.Stage("missing", "Calling", [["no-such-program"]], "something")
-    with pytest.raises(demo.StageFailedError, match="Calling: no-such-program can't be started"):
-        demo.Demo(tmp_path).run([missing])
+    missing = Stage("missing", "Calling", [["no-such-program"]], "something")
+    with pytest.raises(StageFailedError, match="Calling: no-such-program can't be started"):
+        run_stages(tmp_path, [missing])
 
 
 def test_configuration_that_ns_train_prints_is_left_out():
@@ -190,12 +193,12 @@ def test_configuration_that_ns_train_prints_is_left_out():
         "",
         "Saving config",
     ]
-    assert list(demo.without_config(printed)) == ["Using --data", "Saving config"]
+    assert list(without_config(printed)) == ["Using --data", "Saving config"]
 
 
 def test_silent_command_is_said_to_be_running(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(demo, "SILENCE", 0.2)
-    demo.run_command(["python", "-c", "import time; time.sleep(1); print('awake')"], "Sleeping")
+    monkeypatch.setattr(_stages, "SILENCE", 0.2)
+    run_command(["python", "-c", "import time; time.sleep(1); print('awake')"], "Sleeping")
     lines = [line.split(maxsplit=1)[1] for line in capsys.readouterr().out.splitlines()]
     assert lines[1:].count("still running …") >= 2
     assert lines[-1] == "awake"
@@ -208,12 +211,12 @@ def test_newest_run_is_the_one_configured_last(tmp_path):
         config.write_text("")
         os.utime(config, (age, age))
     assert demo.newest_run(tmp_path, "hier-style-draft").name == "a"
-    with pytest.raises(demo.StageFailedError, match="no run of coarse-fewshot"):
+    with pytest.raises(StageFailedError, match="no run of coarse-fewshot"):
         demo.newest_run(tmp_path, "coarse-fewshot")
 
 
 def test_stages_are_the_commands_a_newcomer_would_type(tmp_path):
-    options = demo._parse(["--output", str(tmp_path), "--scene", "blender", "--iterations-coarse", "300"])
+    options = demo.Options(output=tmp_path, scene="blender", iterations_coarse=300)
     stages = demo.make_stages(options)
     coarse, stylised = (shlex.join(stage.commands[0]) for stage in stages[2:4])
     assert coarse.startswith(f"ns-train coarse-fewshot-draft --data {tmp_path}/scene/blender --output-dir")
@@ -224,6 +227,6 @@ def test_stages_are_the_commands_a_newcomer_would_type(tmp_path):
 
 def test_impossible_option_is_refused(capsys):
     with pytest.raises(SystemExit) as ended:
-        demo._parse(["--frames", "0"])
+        demo.main(["--frames", "0"])
     assert ended.value.code == 2
     assert "--frames is 0, but has to be at least 1" in capsys.readouterr().err

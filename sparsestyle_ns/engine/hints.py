@@ -7,7 +7,11 @@ from pathlib import Path
 from typing import Any, List, Optional, Sequence, Union
 
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.engine.trainer import TrainerConfig
 
+from sparsestyle_ns.effects.base import EffectSettings
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
+from sparsestyle_ns.runs.coarse_run import read_coarse_run
 from sparsestyle_ns.utils.progress import say
 
 PAINTING = "PAINTING.jpg"
@@ -26,7 +30,7 @@ def finish(made: Union[Path, str, None], command: Sequence[object]) -> None:
     say(f"{'Nothing was saved' if made is None else f'Made {made}'} – next: {shlex.join(map(str, command))}")
 
 
-def ns_train_style(coarse_run: Path, config: Any, painting: Union[Path, str] = PAINTING) -> List[str]:
+def ns_train_style(coarse_run: Path, config: TrainerConfig, painting: Union[Path, str] = PAINTING) -> List[str]:
     """The command that stylises a coarse run.
 
     Args:
@@ -36,13 +40,11 @@ def ns_train_style(coarse_run: Path, config: Any, painting: Union[Path, str] = P
     """
     method = config.method_name.replace("coarse-fewshot", "hier-style")
     start = ["ns-train", method, "--style-image", str(painting), "--coarse-run", str(coarse_run)]
-    return [*start, *scene_arguments(config, method)]
+    return [*start, *scene_arguments(config)]
 
 
 def after_evaluation(run: Path, stylised: bool) -> List[str]:
     """What follows on the measuring of a run, stylised or coarse, given by its folder."""
-    from sparsestyle_ns.runs.coarse_run import read_coarse_run
-
     return ["sparsestyle", "gallery", str(run)] if stylised else ns_train_style(run, read_coarse_run(run).config)
 
 
@@ -100,22 +102,20 @@ def after_export(run: Path, output_path: Path, format: str) -> List[object]:
     return ["sparsestyle", "export", run, "--format", "html", "--output-path", output_path.with_suffix(".html")]
 
 
-def scene_arguments(config: Any, method: str) -> List[str]:
-    """The end of an ns-train command on the same scene, with the same views and effects.
+def scene_arguments(config: TrainerConfig) -> List[str]:
+    """The end of an ns-train command on the same scene, with the same views, size and effects.
 
     Args:
-        config: the config of a run of either method.
-        method: the name of the method that is to be trained.
+        config: of a run of either method.
     """
-    from sparsestyle_ns.method_configs import method_config
-
-    default, manager = method_config(method), config.pipeline.datamanager
+    manager, usual = config.pipeline.datamanager, FewShotDataManagerConfig()
     arguments: List[str] = []
-    for name in ("num_views", "view_ids", "max_image_side"):
-        arguments += _flag(f"--{name}", getattr(manager, name), getattr(default.pipeline.datamanager, name))
-    arguments += changed_flags(config.pipeline.effects, default.pipeline.effects, "pipeline.effects.")
-    for name in ("output_dir", "vis"):
-        arguments += _flag(f"--{name}", getattr(config, name), getattr(default, name))
+    for name in ("num_views", "view_ids"):
+        arguments += _flag(f"--{name}", getattr(manager, name), getattr(usual, name))
+    arguments += _flag("--max-image-side", manager.max_image_side)  # methods differ in what they do without it
+    arguments += changed_flags(config.pipeline.effects, EffectSettings(), "pipeline.effects.")
+    arguments += _flag("--output-dir", config.output_dir, Path("outputs"))
+    arguments += _flag("--vis", config.vis, "viewer+tensorboard")
     return [*arguments, "--data", str(manager.data or manager.dataparser.data), *_parser(manager.dataparser)]
 
 
@@ -137,7 +137,7 @@ def changed_flags(config: Any, default: Any, prefix: str = "") -> List[str]:
     return flags
 
 
-def _flag(name: str, value: Any, usual: Any) -> List[str]:
+def _flag(name: str, value: Any, usual: Any = None) -> List[str]:
     if value == usual:
         return []
     values = value if isinstance(value, (tuple, list)) else (value,)

@@ -5,31 +5,34 @@ whose colours stay, and the feature network. New are a field, the painting's fea
 model and what is trained or shown meanwhile are only read, so that no lock is held while the field learns.
 """
 
-import functools
+import copy
 import shutil
 import tempfile
 import time
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, ContextManager, Dict, Iterator, Optional, Tuple
+from typing import ContextManager, Dict, Iterator, Optional
 
 import torch
 import yaml
-from nerfstudio.engine.trainer import TrainerConfig
-from torch import nn
-from torch.amp import GradScaler
+from torch import Tensor, nn
 
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import decide_again
+from sparsestyle_ns.engine.style_trainer import HierStyleTrainerConfig
+from sparsestyle_ns.engine.training_step import check_skipped, training_step, warm_start
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleInputs, StyleTask
+from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path, write_checkpoint
 from sparsestyle_ns.runs.scene_record import FILE_NAME as SCENE_RECORD
-from sparsestyle_ns.style.vgg import VGGFeatures
+from sparsestyle_ns.runs.thumbnail import save_thumbnail
+from sparsestyle_ns.style.backbone import Backbone
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.distributed import num_processes
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.names import safe_file_name
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
-from sparsestyle_ns.viewer.styles import StyleImage, save_thumbnail
 
 SEED = 42
 """Of a new field's weights; nerfstudio's own."""
@@ -49,20 +52,20 @@ class Progress:
         words: what it is doing.
         done: the share of all its steps that are done, in [0, 1].
         seconds_left: a guess; None before the first iteration.
-        losses: λ, L_content and L_style of the last iteration; None before the first.
+        losses: those of the last iteration by name, not weighted, and `lambda` (Eq. 6); None before the first.
     """
 
     words: str
     done: float = 0.0
     seconds_left: Optional[float] = None
-    losses: Optional[Tuple[float, float, float]] = None
+    losses: Optional[Dict[str, float]] = None
 
 
 class Workshop:
     """What all restylings of a scene have in common.
 
     Args:
-        pipeline: the `HierStylePipeline` of the scene.
+        pipeline: of the scene.
         folder: of its run.
         lock: held while something changes that other threads may use: the random numbers' state.
 
@@ -70,13 +73,13 @@ class Workshop:
         InputError: several processes train together.
     """
 
-    def __init__(self, pipeline: Any, folder: Path, lock: ContextManager) -> None:
+    def __init__(self, pipeline: HierStylePipeline, folder: Path, lock: ContextManager) -> None:
         if num_processes() > 1:
             raise InputError("Several processes train this scene together; restyle it in ns-viewer, once it is saved.")
         self.pipeline, self.folder, self.lock = pipeline, folder, lock
-        self._backbone: Optional[VGGFeatures] = None
+        self._backbone: Optional[Backbone] = None
 
-    def config(self) -> TrainerConfig:
+    def config(self) -> HierStyleTrainerConfig:
         """The run's config, with the optimiser, the schedule and the number of iterations.
 
         Raises:
@@ -88,7 +91,7 @@ class Workshop:
         except Exception as error:  # yaml builds arbitrary objects, so anything can go wrong in it
             raise InputError(f"{path} can't be read ({error}); restyling takes the run's settings from it.") from error
 
-    def backbone(self) -> VGGFeatures:
+    def backbone(self) -> Backbone:
         """The feature network that the pipeline has, else one with the weights that it would take."""
         if self.pipeline.targets is not None:
             return self.pipeline.targets.backbone
@@ -120,7 +123,7 @@ class Restyling:
         InputError: there are fewer iterations than one.
     """
 
-    def __init__(self, workshop: Workshop, image: StyleImage, iterations: Optional[int] = None) -> None:
+    def __init__(self, workshop: Workshop, image: Painting, iterations: Optional[int] = None) -> None:
         self.workshop, self.pipeline, self.image = workshop, workshop.pipeline, image
         self.config = workshop.config()
         self.iterations = self.config.max_num_iterations if iterations is None else iterations
@@ -132,14 +135,14 @@ class Restyling:
     def __iter__(self) -> Iterator[Progress]:
         yield Progress(f"Looking at {self.image.name}")
         backbone = self.workshop.backbone()
-        targets = self.pipeline.config.targets_of(self.image.pixels.to(self.pipeline.device), backbone)
+        targets = self.pipeline.config.targets_of(StyleInputs(self.image, backbone))
         self.effects = self._decide()
         if self.pipeline.scene_views is None:
             yield Progress("Preparing the views, which the next style won't need")
         task = self.pipeline.new_task(self.field, targets, self.effects)
         warm_up, total = self.pipeline.config.warm_start_steps, self.iterations
         rate = self.config.optimizers["fields"]["optimizer"].lr
-        for step in self.pipeline.warm_up(task, rate):
+        for step in warm_start(self.pipeline, task, rate):
             yield Progress(f"Warm start, step {step + 1} of {warm_up}", (step + 1) / (warm_up + total))
         began = time.monotonic()
         for step in range(total):
@@ -154,21 +157,19 @@ class Restyling:
         scene = replace(self.pipeline.datamanager.scene, style_image=self.image.pixels)
         return decide_again(self.pipeline.effects, "palette", scene)
 
-    def _step(self, task: Any, step: int) -> Tuple[float, float, float]:
-        """One iteration, as nerfstudio's trainer makes it."""
-        self.optimizers.zero_grad_all()
-        _, losses = self.pipeline.step(task, step)
-        functools.reduce(torch.add, losses.terms().values()).backward()
-        self.optimizers.optimizer_scaler_step_some(GradScaler(enabled=False), ["fields"])
-        for scheduler in self.optimizers.schedulers.values():
-            scheduler.step()
-        _, in_a_row = self.optimizers.skipped()
-        if in_a_row >= self.config.max_skipped_steps:
-            raise InputError(
-                f"The gradients of the last {in_a_row} iterations weren't finite; try another image, or a lower "
-                "learning rate in the run's config.yml."
-            )
-        return losses.content_weight, float(losses.content.detach()), float(losses.style.detach())
+    def _step(self, task: StyleTask, step: int) -> Dict[str, float]:
+        """One iteration, as the trainer makes it."""
+        metrics: Dict[str, Tensor | float] = {}
+
+        def compute_losses(step: int) -> Dict[str, Tensor]:
+            _, losses = self.pipeline.losses(task, step)
+            metrics.update(losses.metrics())
+            return losses.terms()
+
+        training_step(self.optimizers, compute_losses, step)
+        advice = "try another image, or a lower learning rate in the run's config.yml."
+        check_skipped(self.optimizers, self.config.max_skipped_steps, advice)
+        return {name: float(value) for name, value in metrics.items()}
 
     def save(self) -> Path:
         """Saves the style as a run of its own beside the one in the viewer, for ns-render, ns-viewer and the rest.
@@ -201,9 +202,6 @@ class Restyling:
 
     def _write_contents(self, new: Path) -> Path:
         """Writes a run but for its config; returns where in it the painting lies."""
-        from sparsestyle_ns.engine.trainer import (
-            without_numpy_scalars,  # which needs the pipelines, and they this package
-        )
 
         painting = Path(PAINTING_FOLDER) / safe_file_name(self.image.name, "painting")
         write_whole(new / painting, self.image.data)
@@ -213,30 +211,29 @@ class Restyling:
                 shutil.copy(self.workshop.folder / name, new / name)
         self.effects.save(new)
         step = self.iterations - 1
-        path = new / self.config.relative_model_dir / f"step-{step:09d}.ckpt"
-        write_whole(path, lambda file: torch.save(without_numpy_scalars(self._state(step)), file))
+        path = checkpoint_path(new / self.config.relative_model_dir, step)
+        write_checkpoint(path, step, self._state(), self.optimizers, self._notes())
         return painting
 
     def _write_config(self, new: Path, folder: Path, painting: Path) -> None:
         """Writes the config of a run that will lie in `folder`."""
-        config = self.config
+        config = copy.deepcopy(self.config)
         config.timestamp, config.max_num_iterations = folder.name, self.iterations
         config.load_dir = config.load_step = config.load_checkpoint = None
         config.pipeline.style_image, config.pipeline.decided = folder / painting, self.effects
         write_whole(new / "config.yml", yaml.dump(config))
 
-    def _state(self, step: int) -> Dict[str, Any]:
-        """A checkpoint like the trainer's."""
-        pipeline = {name: value for name, value in self.pipeline.state_dict().items() if not name.startswith(RESIDUAL)}
-        return {
-            "step": step,
-            "pipeline": {**pipeline, **{RESIDUAL + name: value for name, value in self.field.state_dict().items()}},
-            "optimizers": {name: part.state_dict() for name, part in self.optimizers.optimizers.items()},
-            "schedulers": {name: part.state_dict() for name, part in self.optimizers.schedulers.items()},
-            "scalers": GradScaler(enabled=False).state_dict(),
-            "effects": self.effects.records(),
-            "backbone": asdict(self.workshop.backbone().description),
-            "coarse_run": str(self.config.pipeline.coarse_run),
-            "coarse_field": asdict(self.config.pipeline.model.coarse_field),
-            "fine_encoding": self.config.pipeline.model.fine_encoding,
-        }
+    def _state(self) -> Dict[str, Tensor]:
+        """The pipeline's state, with the new field in place of the run's own."""
+        state = {name: value for name, value in self.pipeline.state_dict().items() if not name.startswith(RESIDUAL)}
+        return {**state, **{RESIDUAL + name: value for name, value in self.field.state_dict().items()}}
+
+    def _notes(self) -> CheckpointNotes:
+        settings = self.config.pipeline
+        return CheckpointNotes(
+            effects=self.effects.records(),
+            backbone=asdict(self.workshop.backbone().description),
+            coarse_run=str(settings.coarse_run),
+            coarse_field=asdict(settings.model.coarse_field),
+            fine_encoding=settings.model.fine_encoding,
+        )

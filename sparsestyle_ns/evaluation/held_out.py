@@ -5,10 +5,13 @@ import statistics
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Dict, List, Optional, Sequence, Union
 
 import torch
 from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.models.base_model import Model
 from torch import Tensor
 from torchvision.utils import save_image
 
@@ -18,15 +21,13 @@ from sparsestyle_ns.core.precision import autocast
 from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.volrend import dense_weights, effective_samples, optical_depth
 from sparsestyle_ns.evaluation.path_frames import render_path
-from sparsestyle_ns.losses.stylization import StyleTargets, covered_rows
+from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID
 from sparsestyle_ns.metrics.gram import gram_distance, gram_matrix
 from sparsestyle_ns.metrics.image import image_metrics, psnr
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
-from sparsestyle_ns.pipelines.base import CheckedPipeline
-from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
-from sparsestyle_ns.runs.run_folder import REPORT_FILE, load_run
+from sparsestyle_ns.runs.run_folder import REPORT_FILE
 from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.progress import track
 
@@ -111,69 +112,95 @@ def saved_report(folder: Path, step: int) -> Optional[SavedReport]:
 
 @torch.no_grad()
 def evaluate_held_out(
-    pipeline: CheckedPipeline,
+    model: Union[CoarseFewShotModel, HierStyleModel],
+    views: InputDataset,
+    training_cameras: Cameras,
     targets: Optional[StyleTargets] = None,
     baked: bool = False,
     picture_folder: Optional[Path] = None,
 ) -> HeldOutReport:
-    """Evaluates a loaded run of either method on all views of its evaluation split, and on the measuring path.
+    """Evaluates a model on views that it hasn't seen, and on the measuring path.
 
-    Coarse run: `psnr` in dB, `ssim`, `lpips` and `st_lpips` where there are weights, and `effective_samples`. Stylised
-    run: the same of the coarse field with the prefix `coarse_`; `content_ssim`; with `targets` what
+    Coarse model: `psnr` in dB, `ssim`, `lpips` and `st_lpips` where there are weights, and `effective_samples`.
+    Stylised model: the same of the coarse field with the prefix `coarse_`; `content_ssim`; with `targets` what
     `stylisation_figures` gives and, where there are weights for it, `art_fid` of all views, with photos as content; and
     the consistency of frames on the measuring path (`PathFrames.figures`), where there are the two training cameras
     that it takes. All of these are of exact renders.
 
     Args:
-        pipeline: in the state in which `eval_setup` leaves it.
-        targets: the painting's features, for a stylised run.
-        baked: whether a stylised run's baked renders are held against the exact ones as well (`baked_psnr`, in dB).
+        model: in evaluation.
+        views: photos and their cameras.
+        training_cameras: those that the measuring path leads through.
+        targets: the painting's features, for a stylised model.
+        baked: whether a stylised model's baked renders are held against the exact ones as well (`baked_psnr`, in dB).
         picture_folder: where to save the views as pictures, beside their photos; None for nowhere.
     """
-    model, views, rays, seconds = pipeline.model, [], [], []
-    dataset = pipeline.datamanager.eval_dataset
-    style_gram = None if targets is None else gram_matrix(targets.style_rows())
-    art_fid = None if targets is None else ArtFID.against(targets.style_image)
-    for index in track(range(len(dataset)), "Held-out views"):
-        camera = dataset.cameras[index : index + 1].to(model.device)
-        photo = dataset[index]["image"][..., :3]
+    measure = _CoarseMeasure(model) if isinstance(model, CoarseFewShotModel) else _StyleMeasure(model, targets, baked)
+    values, rays, seconds = [], [], []
+    for index in track(range(len(views)), "Held-out views"):
+        camera = views.cameras[index : index + 1].to(model.device)
+        photo = views[index]["image"][..., :3]
         start = time.perf_counter()
         outputs = exact_outputs(model, camera)
         seconds.append(time.perf_counter() - start)
         rays.append(photo.shape[0] * photo.shape[1])
-        if isinstance(model, CoarseFewShotModel):
-            values = image_metrics(outputs["rgb"], photo)
-            effective = mean_effective_samples(model, camera)
-            values.update({} if effective is None else {"effective_samples": effective})
-        else:
-            values = {f"coarse_{key}": value for key, value in image_metrics(outputs["rgb_coarse"], photo).items()}
-            values["content_ssim"] = image_metrics(outputs["rgb"], photo)["ssim"]
-            if targets is not None:
-                accumulation = None if model.background is None else outputs["accumulation"].squeeze(-1)
-                values.update(
-                    stylisation_figures(targets, style_gram, outputs["rgb_coarse"], outputs["rgb"], accumulation)
-                )
-            if art_fid is not None:
-                art_fid.add(outputs["rgb"], photo)
-            if baked:
-                with model.rendering("baked"):
-                    values["baked_psnr"] = psnr(model.get_outputs_for_camera(camera)["rgb"], outputs["rgb"])
+        values.append(measure.view(outputs, photo, camera))
         if picture_folder is not None:
-            picture_folder.mkdir(parents=True, exist_ok=True)
-            _, pictures = model.get_image_metrics_and_images(outputs, {"image": photo})
-            for name, picture in pictures.items():
-                save_image(picture.permute(2, 0, 1).cpu(), picture_folder / f"eval_{name}_{index:04d}.png")
-        views.append(values)
-    means = {key: sum(values) / len(values) for key, values in by_figure(views).items()}
-    if art_fid is not None:
-        means.update(art_fid.figures())
-    training_cameras = pipeline.datamanager.train_dataset.cameras
+            _save_pictures(model, outputs, photo, picture_folder, index)
+    means = {key: sum(found) / len(found) for key, found in by_figure(values).items()} | measure.of_all_views()
     if isinstance(model, HierStyleModel) and len(training_cameras) > 1:
         means.update(render_path(model, measuring_path(training_cameras)).figures())
-    return HeldOutReport(means, views, rays, seconds)
+    return HeldOutReport(means, values, rays, seconds)
 
 
-def exact_outputs(model: Any, camera: Any) -> Dict[str, Tensor]:
+class _CoarseMeasure:
+    """What is measured of a coarse model's views."""
+
+    def __init__(self, model: CoarseFewShotModel) -> None:
+        self.model = model
+
+    def view(self, outputs: Dict[str, Tensor], photo: Tensor, camera: Cameras) -> Dict[str, float]:
+        effective = mean_effective_samples(self.model, camera)
+        return image_metrics(outputs["rgb"], photo) | ({} if effective is None else {"effective_samples": effective})
+
+    def of_all_views(self) -> Dict[str, float]:
+        return {}
+
+
+class _StyleMeasure:
+    """What is measured of a stylised model's views."""
+
+    def __init__(self, model: HierStyleModel, targets: Optional[StyleTargets], baked: bool) -> None:
+        self.model, self.targets, self.baked = model, targets, baked
+        self.style_gram = None if targets is None else gram_matrix(targets.style_rows())
+        self.art_fid = None if targets is None else ArtFID.against(targets.style_image)
+
+    def view(self, outputs: Dict[str, Tensor], photo: Tensor, camera: Cameras) -> Dict[str, float]:
+        model, coarse, stylised = self.model, outputs["rgb_coarse"], outputs["rgb"]
+        values = {f"coarse_{key}": value for key, value in image_metrics(coarse, photo).items()}
+        values["content_ssim"] = image_metrics(stylised, photo)["ssim"]
+        if self.targets is not None:
+            accumulation = None if model.background is None else outputs["accumulation"].squeeze(-1)
+            values.update(stylisation_figures(self.targets, self.style_gram, coarse, stylised, accumulation))
+        if self.art_fid is not None:
+            self.art_fid.add(stylised, photo)
+        if self.baked:
+            with model.rendering("baked"):
+                values["baked_psnr"] = psnr(model.get_outputs_for_camera(camera)["rgb"], stylised)
+        return values
+
+    def of_all_views(self) -> Dict[str, float]:
+        return {} if self.art_fid is None else self.art_fid.figures()
+
+
+def _save_pictures(model: Model, outputs: Dict[str, Tensor], photo: Tensor, folder: Path, index: int) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    _, pictures = model.get_image_metrics_and_images(outputs, {"image": photo})
+    for name, picture in pictures.items():
+        save_image(picture.permute(2, 0, 1).cpu(), folder / f"eval_{name}_{index:04d}.png")
+
+
+def exact_outputs(model: Union[CoarseFewShotModel, HierStyleModel], camera: Cameras) -> Dict[str, Tensor]:
     """A camera's outputs, of a stylised run in exact rendering whatever its own mode is; a coarse run has no other."""
     if isinstance(model, CoarseFewShotModel):
         return model.get_outputs_for_camera(camera)
@@ -183,29 +210,31 @@ def exact_outputs(model: Any, camera: Any) -> Dict[str, Tensor]:
 
 def stylisation_figures(
     targets: StyleTargets,
-    style_gram: Float[Tensor, "768 768"],
+    style_gram: Float[Tensor, "C C"],
     coarse: Float[Tensor, "H W 3"],
     stylised: Float[Tensor, "H W 3"],
     accumulation: Optional[Float[Tensor, "H W"]],
 ) -> Dict[str, float]:
     """How strong the style of a view is, before and after stylising, and how far its content has moved.
 
-    `style_loss` is the nearest neighbour feature matching of Eq. 5 and `gram_distance` that of `style_strength`, each
-    with its value for the unstylised view as `…_before`; `content_loss` is the distance of features (Eq. 5) from the
-    unstylised view. With `accumulation`, only where the scene covers the picture: a background can't be stylised.
+    `style_loss` is the nearest neighbour feature matching of Eq. 5, `content_loss` the distance of features (Eq. 5)
+    from the unstylised view, and any other loss of `targets` likewise `NAME_loss`; `gram_distance` is that of
+    `metrics.gram`. All but the content loss come with their value for the unstylised view, as `…_before`. With
+    `accumulation`, only where the scene covers the picture: a background can't be stylised.
     """
     content = targets.features(coarse)
-    values = {}
+    figures = {}
     for suffix, picture in (("_before", coarse), ("", stylised)):
-        style, moved = targets.losses(picture, content, accumulation)
-        gram = gram_matrix(covered_rows(targets.features(picture), accumulation))
-        values[f"style_loss{suffix}"] = float(style)
-        values[f"gram_distance{suffix}"] = float(gram_distance(gram, style_gram))
-    return {**values, "content_loss": float(moved)}
+        view = targets.view(picture, content, accumulation)
+        losses = targets.losses(view)
+        figures.update({f"{name}_loss{suffix}": float(value) for name, value in losses.items()})
+        figures[f"gram_distance{suffix}"] = float(gram_distance(gram_matrix(view.features), style_gram))
+    del figures["content_loss_before"]
+    return figures
 
 
 @torch.no_grad()
-def mean_effective_samples(model: CoarseFewShotModel, camera: Any) -> Optional[float]:
+def mean_effective_samples(model: CoarseFewShotModel, camera: Cameras) -> Optional[float]:
     """Mean of `effective_samples` over a view's rays that meet a surface, on `EVEN_SAMPLES` even samples.
 
     None where no ray does: JSON has no word for a mean of nothing.
@@ -222,26 +251,3 @@ def mean_effective_samples(model: CoarseFewShotModel, camera: Any) -> Optional[f
         counts.append(effective_samples(weights)[weights.sum(dim=-1) > MIN_ACCUMULATION])
     found = torch.cat(counts)
     return float(found.mean()) if len(found) else None
-
-
-def evaluate_run(
-    config_path: Path, output_path: Path, style_image: Optional[Path] = None, baked: bool = False
-) -> HeldOutReport:
-    """Loads a run, evaluates it, and writes the report.
-
-    Args:
-        config_path: the run's config.yml.
-        output_path: JSON file to write.
-        style_image: painting to measure against; None for the one the run was made with. Where that file is gone, the
-            style losses are left out.
-        baked: whether to measure a stylised run's baked renders as well.
-
-    Raises:
-        InputError: the run has no checkpoint.
-    """
-    config, pipeline, step = load_run(config_path)
-    if isinstance(config.pipeline, HierStylePipelineConfig):
-        config.pipeline.style_image = style_image or config.pipeline.style_image
-    report = evaluate_held_out(pipeline, pipeline.painting(), baked)
-    report.save(output_path, config.experiment_name, config.method_name, step)
-    return report

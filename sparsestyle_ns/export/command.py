@@ -11,6 +11,7 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.evaluation.held_out import exact_outputs
 from sparsestyle_ns.export.orbit import make_orbit, most_central, pinholes, resized, survey
 from sparsestyle_ns.export.page import build_page, fit_page
@@ -28,7 +29,6 @@ from sparsestyle_ns.export.points import (
 from sparsestyle_ns.export.voxels import Voxels, bake_voxels, render_voxels
 from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.models.hier_style import RAYS_PER_CALL, HierStyleModel
-from sparsestyle_ns.runs.run_folder import load_run
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.output_file import write_output
 from sparsestyle_ns.utils.progress import track

@@ -22,7 +22,6 @@ from sparsestyle_ns.rendering.baked import (
     DENSITY_UNIT,
     SIDE,
     BakedVolume,
-    Rays,
     decode,
     encode,
     render_baked,
@@ -71,15 +70,13 @@ def bake_voxels(model: HierStyleModel, resolution: int, cameras: Sequence[Camera
         resolution: cells along a side of the cube.
         cameras: one camera each, with a ray for each pixel; a brick should be some pixels wide.
     """
-    volume, config = model.bake(resolution), model.config
+    volume = model.bake(resolution)
     for camera in track(cameras, "Finding what can be seen"):
         bundle = camera.to(model.device).generate_rays(camera_indices=0, keep_shape=False).flatten()
         for origins, directions in zip(
             bundle.origins.split(RAYS_PER_CALL), bundle.directions.split(RAYS_PER_CALL), strict=True
         ):
-            segments = model.space.segments(origins, directions)
-            rays = Rays(segments, model.occupancy, config.num_steps, model.space.unbounded, config.min_transmittance)
-            render_baked(volume, rays, model.background)
+            render_baked(volume, model.space.segments(origins, directions), model.marching, model.background)
     filled = torch.ones(1, 1, 1, dtype=torch.bool, device=model.device)  # where nothing is known to be empty
     if model.occupancy is not None:
         filled = model.occupancy.occupied
@@ -94,7 +91,7 @@ def bake_voxels(model: HierStyleModel, resolution: int, cameras: Sequence[Camera
     codes = torch.zeros(*known.shape, 4, dtype=torch.uint8, device=known.device)
     codes[..., 0] = EMPTY
     index = known.nonzero()
-    codes[known] = torch.cat([shown_codes(volume, part, model.look.mix) for part in index.split(CELLS_PER_CALL)])
+    codes[known] = torch.cat([shown_codes(volume, part, model.display.own.mix) for part in index.split(CELLS_PER_CALL)])
     return Voxels(codes.cpu(), known.cpu(), filled.cpu())
 
 

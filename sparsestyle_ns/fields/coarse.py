@@ -1,6 +1,7 @@
 """The coarse field F_c (Eq. 1): what a scene looks like from afar, learned from three to eight photos."""
 
 import math
+from dataclasses import dataclass
 from typing import Dict, List, Literal, Optional, Tuple
 
 import torch
@@ -133,3 +134,31 @@ class CoarseField(Field):
     ) -> Dict[FieldHeadNames, Tensor]:
         """nerfstudio's form of `color`."""
         return {FieldHeadNames.RGB: self.color(density_embedding, ray_samples.frustums.directions)}
+
+
+@dataclass
+class CoarseFieldConfig:
+    """The shape of the coarse field."""
+
+    num_levels: int = 7
+    """Octaves of the positional encoding of x."""
+    num_layers: int = 6
+    """Hidden layers."""
+    layer_width: int = 256
+    """Units in a hidden layer."""
+    feature_dim: int = 64
+    """Length of the geometric feature e_c."""
+    direction_levels: int = 4
+    """Octaves of the view direction's encoding, where colour depends on it (`--pipeline.effects.view-color`)."""
+    density_activation: DensityActivation = "exp"
+    """What keeps the density positive. exp finds surfaces sooner than softplus (README, Where the paper is silent)."""
+    density_bias: float = 1.0
+    """Added to the density's logit: a field that starts as dense fog is less drawn to the far end of its rays."""
+
+    def setup(self, view_dependent: bool) -> CoarseField:
+        """The field.
+
+        Args:
+            view_dependent: whether its colour depends on the view direction.
+        """
+        return CoarseField(**(vars(self) | ({} if view_dependent else {"direction_levels": None})))

@@ -10,12 +10,13 @@ from PIL import Image
 
 from sparsestyle_ns.data.photos import PhotoDataset, at_size
 from sparsestyle_ns.data.view_selection import evenly_spaced
-from sparsestyle_ns.evaluation.held_out import SavedReport, evaluate_held_out, exact_outputs, saved_report
+from sparsestyle_ns.engine.loading import load_run
+from sparsestyle_ns.evaluation.held_out import SavedReport, exact_outputs, saved_report
 from sparsestyle_ns.evaluation.tables import report_tables
 from sparsestyle_ns.gallery.film import as_pixels, make_film
 from sparsestyle_ns.gallery.page import Picture, RunPictures, View, read_film
-from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config, load_run
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.page import Pixels
 from sparsestyle_ns.utils.progress import say, track
@@ -54,7 +55,7 @@ def collect_run(
         film = make_film(pipeline.model, dataset.cameras, frames, LONGEST_SIDE)
     report = saved_report(config_path.parent, step)
     if report is None and evaluate:
-        made = evaluate_held_out(pipeline, pipeline.painting())
+        made = pipeline.held_out_report()
         report = SavedReport(made.means, len(made.views))
         try:
             made.save(config_path.parent / REPORT_FILE, config.experiment_name, config.method_name, step)
@@ -143,7 +144,7 @@ def _style_picture(path: Optional[Path]) -> Optional[Picture]:
     if path is None:
         return None
     try:
-        image = load_style_image(path)
+        image = Painting.read(path).pixels
     except InputError:
         return None
     return Picture(_fitted(Image.fromarray(as_pixels(image.permute(1, 2, 0).numpy()))), path.name)
@@ -172,6 +173,7 @@ def _figures(measured: Sequence[Dict[str, float]]) -> List[Tuple[str, str]]:
 def _settings(config: Any, dataset: Any, step: int) -> List[Tuple[str, str]]:
     pipeline = config.pipeline
     height, width = int(dataset.cameras.height[0]), int(dataset.cameras.width[0])
+    weight = pipeline.loss_weights["content"]
     return [
         ("Method", config.method_name),
         ("Made", config.timestamp),
@@ -184,8 +186,7 @@ def _settings(config: Any, dataset: Any, step: int) -> List[Tuple[str, str]]:
         ("Size it sees views at", f"{pipeline.feature_side} pixels"),
         (
             "Content weight λ",
-            f"{pipeline.content_weight:g} to {pipeline.content_weight * pipeline.content_decay:g} in "
-            f"{pipeline.content_steps} iterations",
+            f"{weight:g} to {weight * pipeline.content_decay:g} in {pipeline.content_steps} iterations",
         ),
         ("Warm start", f"{pipeline.warm_start_steps} steps"),
     ]

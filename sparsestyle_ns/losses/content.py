@@ -6,6 +6,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestyle_ns.core.precision import at_least_float32
+from sparsestyle_ns.losses.base import StylizationLoss, StylizedView
+
+
+class ContentLoss(StylizationLoss):
+    """L_content of Eq. 5; its weight is λ0, which falls while a scene is stylised (Eq. 6)."""
+
+    weight = 10.0
+
+    def __call__(self, view: StylizedView) -> Float[Tensor, ""]:
+        """See `content_loss`."""
+        return content_loss(view.features, view.content)
 
 
 def content_loss(features: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:

@@ -1,150 +1,34 @@
 """The style loss: nearest neighbour feature matching (NNFM; ARF, Sec. 4).
 
 `nearest_neighbors` compares everything with everything; a `StyleIndex`, made once for a style, gives the same
-neighbours with a tenth of the work.
+neighbours faster.
 """
 
-import math
-from typing import List, Optional, Tuple, Union
+from typing import Optional, Union
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestyle_ns.core.precision import at_least_float32, without_autocast
+from sparsestyle_ns.losses.base import PaintingFeatures, StylizationLoss, StylizedView
+from sparsestyle_ns.losses.style_index import SHORTEST, StyleIndex, check_style, unit_vectors
 
 CHUNK_SIZE = 2048
 """Feature vectors compared at once; 2048 × 2048 similarities are 16 MiB in float32."""
 
-SHORTEST = 1e-12
-"""Vectors no longer than this have no direction."""
 
-COARSE, FINE = 23, 127
-"""Principal directions in which similarities are bounded, first of all pairs and then of those that are left."""
+class NNFMLoss(StylizationLoss):
+    """L_style of Eq. 5: each feature vector of a view against its nearest one of the painting."""
 
-BLOCK_SIZES = {"cpu": 128, "cuda": 1024}
-"""Most style vectors in a block of a `StyleIndex`; a GPU wants fewer and larger products."""
+    weight = 1.0
 
-BOUNDED_AT_ONCE = {"cpu": 1024, "cuda": 4096}
-"""Vectors of either kind whose similarities are bounded at once; on a CPU the bounds should stay in its cache."""
+    def __init__(self, painting: PaintingFeatures) -> None:
+        self.index = StyleIndex(painting.rows)
 
-TABLE_SIZE = 1 << 23
-"""Bounds kept at once, one for each feature vector and block; 32 MiB in float32."""
-
-BASIS_SAMPLE = 4096
-"""Style vectors from which the principal directions are found."""
-
-
-class StyleIndex:
-    """A style's feature vectors, arranged so that the most similar one is found without comparing with all.
-
-    Let a(x) be the coefficients of a unit vector x in k orthonormal directions, and p(x) = √(1 − |a(x)|²) the length
-    of the rest. Then (Cauchy–Schwarz)
-
-        cos(f, s) ≤ a(f) · a(s) + p(f) p(s) = (a(f), p(f)) · (a(s), p(s)),
-
-    a product of k + 1 instead of C numbers. In the style's own principal directions it is tight: with k = 23 of the
-    768 channels of VGG's third block about 3% of a painting's vectors can't be ruled out. They lie together, as the
-    vectors are sorted into blocks of similar ones, so each block is compared with those features, in one matrix
-    product, for which its largest bound reaches the best similarity found so far. That product is the plain search's,
-    and what was ruled out could not have won: the answer is the plain search's as well.
-
-    Args:
-        style_features: one vector a row, M ≥ 1. The index holds a copy of their directions.
-        block_size: most vectors in a block, 1 or more; None: as `BLOCK_SIZES` says. It changes time, not the answer.
-
-    Raises:
-        ValueError: there are no style features.
-
-    Example:
-        >>> style = StyleIndex(torch.rand(1000, 768))
-        >>> style.nearest(3 * style.directions_of(torch.tensor([7, 7, 421])))
-        tensor([  7,   7, 421])
-    """
-
-    @torch.no_grad()
-    @without_autocast
-    def __init__(self, style_features: Float[Tensor, "M C"], block_size: Optional[int] = None) -> None:
-        _check_style(style_features)
-        directions = _directions(style_features)
-        device = directions.device
-        first = _first_equal(directions)
-        distinct = first.unique()
-        axes = _principal_axes(directions)
-        self.bases = [axes[:, :count].contiguous() for count in (COARSE, FINE)]
-        coarse, fine = (_outline(directions, basis) for basis in self.bases)
-        self.rows = distinct[_similar_blocks(coarse[distinct], block_size or BLOCK_SIZES.get(device.type, 1024))]
-        self.blocks, self.coarse, self.fine = directions[self.rows], coarse[self.rows], fine[self.rows]
-        places = torch.empty_like(first)
-        places[self.rows.flatten()] = torch.arange(self.rows.numel(), device=device)
-        self._places = places[first]
-
-    def directions_of(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N C"]:
-        """Style vectors in these rows of `style_features`, of length 1 or, where they have no direction, 0."""
-        return self.blocks.flatten(0, 1)[self._places[rows]]
-
-    @torch.no_grad()
-    @without_autocast
-    def nearest(self, features: Float[Tensor, "N C"]) -> Int[Tensor, " N"]:
-        """As `nearest_neighbors`; of style vectors with equal directions the first is given."""
-        rows_at_once = max(1, TABLE_SIZE // len(self.blocks))
-        return torch.cat([self._nearest(part) for part in _directions(features).split(rows_at_once)])
-
-    def _nearest(self, directions: Float[Tensor, "n C"]) -> Int[Tensor, " n"]:
-        coarse, fine = (_outline(directions, basis) for basis in self.bases)
-        matches = _Matches(directions, self.blocks)
-
-        bounds = self._bounds(coarse)
-        favorites = bounds.argmax(dim=0)
-        matches.compare(*_sorted_pairs(favorites))
-        bounds.scatter_(0, favorites[None], -torch.inf)
-        blocks, rows = (bounds >= matches.best).nonzero(as_tuple=True)
-
-        finer_bounds, _ = _block_maxima(fine, self.fine, blocks, rows)
-        is_favorite = finer_bounds == _maxima_by_row(finer_bounds, rows, len(directions))[rows]
-        matches.compare(blocks[is_favorite], rows[is_favorite])
-        is_left = ~is_favorite & (finer_bounds >= matches.best[rows])
-        matches.compare(blocks[is_left], rows[is_left])
-        return matches.first(self.rows)
-
-    def _bounds(self, outlines: Float[Tensor, "n k"]) -> Float[Tensor, "blocks n"]:
-        """Bounds of the similarities between each feature vector and any style vector of each block."""
-        num_blocks, block_size, _ = self.coarse.shape
-        side = BOUNDED_AT_ONCE.get(outlines.device.type, 4096)
-        blocks_at_once = max(1, side // block_size)
-        bounds = outlines.new_empty(num_blocks, len(outlines))
-        # Memory that is new for each product would cost as much time as the product.
-        buffer = outlines.new_empty(blocks_at_once * block_size * side)
-        for part, part_bounds in zip(outlines.split(side), bounds.split(side, dim=1), strict=True):
-            for blocks, out in zip(self.coarse.split(blocks_at_once), part_bounds.split(blocks_at_once), strict=True):
-                products = buffer[: len(blocks) * block_size * len(part)].view(len(blocks) * block_size, len(part))
-                torch.mm(blocks.flatten(0, 1), part.T, out=products)
-                torch.amax(products.view(len(blocks), block_size, len(part)), dim=1, out=out)
-        return bounds
-
-
-class _Matches:
-    """The best similarity of each feature vector so far, and all pairs that were compared."""
-
-    def __init__(self, directions: Float[Tensor, "n C"], blocks: Float[Tensor, "blocks size C"]) -> None:
-        self.directions = directions
-        self.blocks = blocks
-        self.best = directions.new_full((len(directions),), -torch.inf)
-        self._compared: List[Tuple[Tensor, Tensor, Tensor, Tensor]] = []
-
-    def compare(self, blocks: Int[Tensor, " P"], rows: Int[Tensor, " P"]) -> None:
-        """Compares feature vectors with all style vectors of a block, for pairs sorted by block."""
-        values, places = _block_maxima(self.directions, self.blocks, blocks, rows)
-        self.best.scatter_reduce_(0, rows, values, "amax")
-        self._compared.append((rows, values, blocks, places))
-
-    def first(self, names: Int[Tensor, "blocks size"]) -> Int[Tensor, " n"]:
-        """Of each feature vector's most similar style vectors the smallest name."""
-        rows, values, blocks, places = (torch.cat(parts) for parts in zip(*self._compared, strict=True))
-        is_best = values == self.best[rows]
-        found = names[blocks[is_best], places[is_best]]
-        nearest = rows.new_zeros(len(self.best))
-        return nearest.scatter_reduce_(0, rows[is_best], found, "amin", include_self=False)
+    def __call__(self, view: StylizedView) -> Float[Tensor, ""]:
+        """See `nnfm_loss`."""
+        return nnfm_loss(view.features, self.index)
 
 
 @without_autocast
@@ -173,9 +57,9 @@ def nearest_neighbors(
     """
     if isinstance(style_features, StyleIndex):
         return style_features.nearest(features)
-    _check_style(style_features)
+    check_style(style_features)
     with torch.no_grad():
-        directions, style_directions = _directions(features), _directions(style_features)
+        directions, style_directions = unit_vectors(features), unit_vectors(style_features)
         chunks = [_nearest_of_chunk(rows, style_directions, chunk_size) for rows in directions.split(chunk_size)]
         return torch.cat(chunks)
 
@@ -215,17 +99,12 @@ def nnfm_loss(
     if isinstance(style_features, StyleIndex):
         matches = style_features.directions_of(neighbors)
     else:
-        matches = _directions(style_features.detach()[neighbors])
+        matches = unit_vectors(style_features.detach()[neighbors])
     features = at_least_float32(features)
     length = torch.linalg.vector_norm(features, dim=-1)
     # The features' directions themselves would be one more large tensor to fill, keep and differentiate.
     cosines = torch.linalg.vecdot(features, matches) / length.clamp_min(SHORTEST)
     return (1 - torch.where(length > SHORTEST, cosines.clamp(-1.0, 1.0), 0.0)).mean()
-
-
-def _check_style(style_features: Float[Tensor, "M C"]) -> None:
-    if len(style_features) == 0:
-        raise ValueError("there is no style feature to match: the style image gave none")
 
 
 def _nearest_of_chunk(
@@ -239,84 +118,3 @@ def _nearest_of_chunk(
         nearest = torch.where(values > best, rows + start, nearest)
         best = torch.maximum(values, best)
     return nearest
-
-
-def _directions(vectors: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
-    """Vectors of length 1, or of length 0 where there is no direction."""
-    vectors = at_least_float32(vectors)
-    length = torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
-    return torch.where(length > SHORTEST, vectors / length.clamp_min(SHORTEST), 0.0)
-
-
-def _first_equal(rows: Float[Tensor, "M C"]) -> Int[Tensor, " M"]:
-    """For each row the first row that is equal to it."""
-    _, group = torch.unique(rows, dim=0, return_inverse=True)
-    index = torch.arange(len(rows), device=rows.device)
-    return torch.full_like(index, len(rows)).scatter_reduce_(0, group, index, "amin")[group]
-
-
-def _principal_axes(directions: Float[Tensor, "M C"]) -> Float[Tensor, "C C"]:
-    """Orthonormal columns, those first in which the vectors are longest."""
-    # Any orthonormal columns bound similarities; a sample gives bounds as good as all.
-    sample = directions[:: -(-len(directions) // BASIS_SAMPLE)].double()
-    _, axes = torch.linalg.eigh(sample.T @ sample)
-    return axes.flip(1).to(directions.dtype)
-
-
-def _outline(directions: Float[Tensor, "N C"], basis: Float[Tensor, "C k"]) -> Float[Tensor, "N k+1"]:
-    """Coefficients of unit vectors in a basis, and the length of the rest; products of two bound the vectors' own.
-
-    The length gets an allowance τ under the root, as √((p² + τ)(q² + τ)) ≥ p q + τ for any p, q ≥ 0. It covers all
-    rounding: with u the unit of it, C u the error of a product of unit vectors and √k C u that of their coefficients,
-    2 √k C u in p², as much in a(f) · a(s), and less than 8 C u in lengths, in the sum and in the similarity that it is
-    compared with.
-    """
-    channels, count = basis.shape
-    unit = torch.finfo(directions.dtype).eps / 2
-    allowance = 4 * (math.sqrt(count) + 2) * (channels + 2) * unit
-    coefficients = directions @ basis
-    rest = (1 - coefficients.square().sum(dim=-1, keepdim=True)).clamp_min(0) + allowance
-    return torch.cat([coefficients, rest.sqrt()], dim=-1)
-
-
-def _similar_blocks(points: Float[Tensor, "M k"], block_size: int) -> Int[Tensor, "blocks size"]:
-    """Rows of `points` in blocks of at most this many, similar ones together, each block's in ascending order.
-
-    All points are halved at the median of the coordinate that varies most, then each half, and so on (a k-d tree).
-    Where they can't be shared out evenly, the last occurs more than once.
-    """
-    depth = (-(-len(points) // block_size) - 1).bit_length()
-    leaf_size = -(-len(points) // 2**depth)
-    order = torch.arange(2**depth * leaf_size, device=points.device).clamp_max(len(points) - 1)
-    for level in range(depth):
-        nodes = order.view(2**level, -1)
-        members = points[nodes]
-        widest = members.var(dim=1).argmax(dim=-1)
-        keys = members.gather(2, widest[:, None, None].expand(-1, members.shape[1], 1)).squeeze(2)
-        order = nodes.gather(1, keys.argsort(dim=1))
-    return order.view(2**depth, leaf_size).sort(dim=1).values
-
-
-def _sorted_pairs(blocks: Int[Tensor, " n"]) -> Tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
-    """Each row with its block, sorted by block."""
-    rows = blocks.argsort()
-    return blocks[rows], rows
-
-
-def _block_maxima(
-    vectors: Float[Tensor, "n K"],
-    style_blocks: Float[Tensor, "blocks size K"],
-    blocks: Int[Tensor, " P"],
-    rows: Int[Tensor, " P"],
-) -> Tuple[Float[Tensor, " P"], Int[Tensor, " P"]]:
-    """The largest product of a vector with those of a block, and its first place there, for pairs sorted by block."""
-    counts = torch.bincount(blocks, minlength=len(style_blocks)).tolist()
-    maxima = [
-        (vectors[members] @ block.T).max(dim=1) for block, members in zip(style_blocks, rows.split(counts), strict=True)
-    ]
-    values, places = zip(*maxima, strict=True)
-    return torch.cat(values), torch.cat(places)
-
-
-def _maxima_by_row(values: Float[Tensor, " P"], rows: Int[Tensor, " P"], num_rows: int) -> Float[Tensor, " num_rows"]:
-    return values.new_full((num_rows,), -torch.inf).scatter_reduce_(0, rows, values, "amax")

@@ -19,8 +19,8 @@ def semantic_loss(embeddings: Float[Tensor, "B C"], targets: Float[Tensor, "B C"
     DietNeRF writes it as ½ |φ − φ*|² of embeddings of length 1, which is the same.
 
     Args:
-        embeddings: of rendered views. One no longer than `nnfm.SHORTEST` has no direction: it counts as cosine 0 and
-            gets a gradient of zero.
+        embeddings: of rendered views. One no longer than `style_index.SHORTEST` has no direction: it counts as cosine
+            0 and gets a gradient of zero.
         targets: of photos, each of its render's. They get no gradient.
 
     Returns:

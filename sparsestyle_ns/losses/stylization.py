@@ -1,26 +1,64 @@
-"""What a stylised view is compared with: features of the style image and of the content picture of each view."""
+"""The losses of stage 2 by name, and what a stylised view is compared with.
 
-from typing import Optional, Tuple
+A new loss is a file with a `StylizationLoss`, and its line in `LOSSES`. Its weight is a setting of every run from then
+on, and training, the viewer, `sparsestyle evaluate` and the studies show it under its name.
+"""
+
+from dataclasses import dataclass
+from typing import Collection, Dict, Optional, Type
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestyle_ns.losses.content import content_loss
-from sparsestyle_ns.losses.nnfm import StyleIndex, nnfm_loss
-from sparsestyle_ns.style.painting import SMALLEST_SIDE
-from sparsestyle_ns.style.vgg import VGGFeatures
+from sparsestyle_ns.losses.base import PaintingFeatures, StylizationLoss, StylizedView
+from sparsestyle_ns.losses.content import ContentLoss
+from sparsestyle_ns.losses.nnfm import NNFMLoss
+from sparsestyle_ns.style.backbone import Backbone
+
+LOSSES: Dict[str, Type[StylizationLoss]] = {"content": ContentLoss, "style": NNFMLoss}
+"""All stylisation losses, by name."""
 
 
-def fit_side(image: Float[Tensor, "B C H W"], longer_side: int) -> Float[Tensor, "B C h w"]:
+def default_weights() -> Dict[str, float]:
+    """Each loss's own weight."""
+    return {name: loss.weight for name, loss in LOSSES.items()}
+
+
+@dataclass(frozen=True)
+class Losses:
+    """What an iteration minimises.
+
+    Attributes:
+        values: of the losses, by name, not weighted.
+        weights: of each in this iteration.
+    """
+
+    values: Dict[str, Float[Tensor, ""]]
+    weights: Dict[str, float]
+
+    def terms(self) -> Dict[str, Float[Tensor, ""]]:
+        """The summands of L_total (Eq. 5), as `NAME_loss`."""
+        return {f"{name}_loss": self.weights[name] * value for name, value in self.values.items()}
+
+    def metrics(self) -> Dict[str, Tensor | float]:
+        """The values without their gradients, and λ, the weight of the content loss (Eq. 6)."""
+        values = {name: value.detach() for name, value in self.values.items()}
+        return {**values, "lambda": self.weights.get("content", 0.0)}
+
+
+def fit_side(image: Float[Tensor, "B C H W"], longer_side: int, smallest_side: int = 1) -> Float[Tensor, "B C h w"]:
     """An image enlarged or reduced (bilinear, antialiased) so that its longer side has this many pixels.
 
-    The shorter side gets at least `SMALLEST_SIDE`.
+    Args:
+        image: any.
+        longer_side: in pixels.
+        smallest_side: the least that either side gets.
     """
     height, width = image.shape[-2:]
     scale = longer_side / max(height, width)
-    size = (max(SMALLEST_SIDE, round(height * scale)), max(SMALLEST_SIDE, round(width * scale)))
+    size = (max(smallest_side, round(height * scale)), max(smallest_side, round(width * scale)))
     if size == (height, width):
         return image
     return F.interpolate(image, size=size, mode="bilinear", antialias=True, align_corners=False)
@@ -51,7 +89,7 @@ def covered_rows(
 
 
 class StyleTargets:
-    """Style and content losses of an image against fixed targets (the two terms of Eq. 5).
+    """A painting as the feature network sees it, and the losses of pictures against it (the terms of Eq. 5).
 
     Kept out of the model's modules: a stylised checkpoint holds neither the network nor the painting.
 
@@ -61,15 +99,17 @@ class StyleTargets:
         feature_side: longer side, in pixels, at which the network sees rendered and content pictures.
         style_side: longer side at which it sees the style image; it sets how large strokes are.
         style_features: at most so many of the style image's feature vectors count, drawn at random; None: all.
+        losses: names of those to compute.
     """
 
     def __init__(
         self,
-        backbone: VGGFeatures,
+        backbone: Backbone,
         style_image: Float[Tensor, "3 H W"],
         feature_side: int,
         style_side: int,
         style_features: Optional[int] = None,
+        losses: Collection[str] = ("content", "style"),
     ) -> None:
         self.backbone = backbone
         self.feature_side = feature_side
@@ -77,24 +117,28 @@ class StyleTargets:
         self.style_image = style_image
         with torch.no_grad():
             rows = self.style_rows()
-            self.style = StyleIndex(rows if style_features is None else sample_rows(rows, style_features))
+            painting = PaintingFeatures(
+                style_image, rows if style_features is None else sample_rows(rows, style_features)
+            )
+            self.by_name = {name: LOSSES[name](painting) for name in losses}
 
-    def features(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 768 h w"]:
+    def features(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 C h w"]:
         """The network's view of a picture."""
-        return self.backbone(fit_side(image.permute(2, 0, 1)[None], self.feature_side))
+        return self.backbone(fit_side(image.permute(2, 0, 1)[None], self.feature_side, self.backbone.smallest_side))
 
     @torch.no_grad()
-    def style_rows(self) -> Float[Tensor, "rows 768"]:
-        """The style image's feature vectors, as the network gives them; the index keeps their directions alone."""
-        return feature_rows(self.backbone(fit_side(self.style_image[None], self.style_side)))
+    def style_rows(self) -> Float[Tensor, "rows C"]:
+        """The style image's feature vectors, as the network gives them."""
+        image = fit_side(self.style_image[None], self.style_side, self.backbone.smallest_side)
+        return feature_rows(self.backbone(image))
 
-    def losses(
+    def view(
         self,
         image: Float[Tensor, "H W 3"],
-        content: Float[Tensor, "1 768 h w"],
+        content: Float[Tensor, "1 C h w"],
         accumulation: Optional[Float[Tensor, "H W"]] = None,
-    ) -> Tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """L_style and L_content of a rendered picture.
+    ) -> StylizedView:
+        """A rendered picture, ready for the losses.
 
         Args:
             image: the picture, in [0, 1].
@@ -103,4 +147,8 @@ class StyleTargets:
                 background that nothing can stylise, and its features don't count. None: all count.
         """
         features, target = (covered_rows(maps, accumulation) for maps in (self.features(image), content))
-        return nnfm_loss(features, self.style), content_loss(features, target)
+        return StylizedView(image, features, target)
+
+    def losses(self, view: StylizedView) -> Dict[str, Float[Tensor, ""]]:
+        """The losses of a view, by name, not weighted."""
+        return {name: loss(view) for name, loss in self.by_name.items()}

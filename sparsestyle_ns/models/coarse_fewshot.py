@@ -19,39 +19,14 @@ from sparsestyle_ns.core.volrend import distortion, effective_samples
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.field_components.positional_encoding import revealed_levels
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
-from sparsestyle_ns.fields.coarse import CoarseField, DensityActivation
+from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.losses.geometry import matched_depth_loss, near_density
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.metrics.image import image_metrics
 from sparsestyle_ns.models.scene_model import SceneModel
-from sparsestyle_ns.rendering.render import DenseRender, render_coarse, seen_behind
+from sparsestyle_ns.rendering.render import DenseRender, render_coarse, seen_behind, surface_distance
 from sparsestyle_ns.utils.distributed import gather_rays, num_processes, shard_rays
 from sparsestyle_ns.utils.errors import InputError
-
-
-@dataclass
-class CoarseFieldConfig:
-    """The shape of the coarse field."""
-
-    num_levels: int = 7
-    """Octaves of the positional encoding of x."""
-    num_layers: int = 6
-    """Hidden layers."""
-    layer_width: int = 256
-    """Units in a hidden layer."""
-    feature_dim: int = 64
-    """Length of the geometric feature e_c."""
-    direction_levels: int = 4
-    """Octaves of the view direction's encoding, where colour depends on it (`--pipeline.effects.view-color`)."""
-    density_activation: DensityActivation = "exp"
-    """What keeps the density positive. exp finds surfaces sooner than softplus (README, Where the paper is silent)."""
-    density_bias: float = 1.0
-    """Added to the density's logit: a field that starts as dense fog is less drawn to the far end of its rays."""
-
-    def setup(self, effects: Decisions) -> CoarseField:
-        """The field, for what was decided about the scene."""
-        levels = self.direction_levels if effects.on("view_color") else None
-        return CoarseField(**(vars(self) | {"direction_levels": levels}))
 
 
 @dataclass
@@ -110,7 +85,7 @@ class CoarseFewShotModel(SceneModel):
         if not 0.0 < self.config.even_share <= 1.0:
             share = self.config.even_share
             raise InputError(f"--pipeline.model.even-share is {share}; give a number above 0 and up to 1.")
-        self.field = self.config.coarse_field.setup(self.effects)
+        self.field = self.config.coarse_field.setup(self.effects.on("view_color"))
         self.build_grid(self.effects)
         self.step = 0
         self.num_steps = 1
@@ -191,7 +166,7 @@ class CoarseFewShotModel(SceneModel):
         """`rgb`, `accumulation`, and `depth` in world units; in training also what the losses need."""
         if not self.training:
             render, segments = self.render_rays(ray_bundle, self.config.num_eval_samples)
-            depth = segments.distance(render.s.clamp(max=1.0 - 1e-4))
+            depth = surface_distance(segments, render.s)
             return {"rgb": render.rgb, "accumulation": render.accumulation, "depth": depth}
         segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
         render, edges = self.render_batch(segments, ray_bundle.origins, ray_bundle.directions)

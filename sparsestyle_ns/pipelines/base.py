@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Dict, Literal, Optional, Union
+from typing import Annotated, Any, Callable, Dict, Literal, Optional, Union
 
 import torch
 import tyro
@@ -15,12 +15,13 @@ from torch.amp import GradScaler
 from sparsestyle_ns.data.scene_info import scene_info
 from sparsestyle_ns.effects.base import Decisions, EffectSettings
 from sparsestyle_ns.effects.registry import decide
+from sparsestyle_ns.evaluation.held_out import HeldOutReport, evaluate_held_out
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, FewShotDataManagerConfig
-from sparsestyle_ns.style.vgg import VGGFeatures, load_backbone
+from sparsestyle_ns.style.backbone import Backbone
+from sparsestyle_ns.style.backbones import BackboneChoice, load_backbone
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.ffmpeg import put_ffmpeg_on_path
-from sparsestyle_ns.viewer.effects_panel import EffectsPanel
 
 TestMode = Literal["test", "val", "inference"]
 
@@ -38,12 +39,12 @@ class CheckedPipelineConfig(VanillaPipelineConfig):
     vgg_weights: Annotated[Optional[Path], tyro.conf.arg(aliases=("--vgg-weights",))] = None
     """File with the weights of VGG-16. None: torchvision's, where they are cached or can be downloaded, else those in
     the package stlpips-pytorch."""
-    backbone: Annotated[Literal["auto", "vgg16", "vgg16-shift-tolerant"], tyro.conf.arg(aliases=("--backbone",))] = (
-        "auto"
-    )
-    """Feature network; auto takes whichever of the two has weights."""
+    backbone: Annotated[BackboneChoice, tyro.conf.arg(aliases=("--backbone",))] = "auto"
+    """Feature network; auto takes the first that has weights."""
+    panel: tyro.conf.Suppress[Optional[Callable[["CheckedPipeline"], Union[ViewerElement, ViewerControl]]]] = None
+    """Makes what the viewer shows of a run beside nerfstudio's own controls; None: nothing."""
 
-    def load_backbone(self, device: torch.device) -> VGGFeatures:
+    def load_backbone(self, device: torch.device) -> Backbone:
         """The feature network of these settings.
 
         Raises:
@@ -89,13 +90,9 @@ class CheckedPipeline(VanillaPipeline):
             device=device,
         ).to(device)
         CONSOLE.print("Effects:", self.effects.text(), sep="\n", soft_wrap=True, highlight=False)
-        self.panel = self.make_panel()
+        self.panel = None if config.panel is None else config.panel(self)  # nerfstudio's viewer finds it here
         if test_mode != "val":
             put_ffmpeg_on_path()
-
-    def make_panel(self) -> Union[ViewerElement, ViewerControl]:
-        """What the viewer shows of this run beside nerfstudio's own controls."""
-        return EffectsPanel(lambda: self.effects.markdown())
 
     @property
     def effects(self) -> Decisions:
@@ -103,24 +100,34 @@ class CheckedPipeline(VanillaPipeline):
         assert self.config.decided is not None
         return self.config.decided
 
-    def announce(self, backbone: VGGFeatures) -> None:
+    def announce(self, backbone: Backbone) -> None:
         """Says which feature network is in use, and where its weights came from."""
         description = backbone.description
         CONSOLE.print(f"Features: {description.name}, {description.source}", soft_wrap=True)
 
-    def painting(self) -> Optional[StyleTargets]:
-        """The painting to measure against, where the method has one and it is still there."""
+    def style_targets(self, style_image: Optional[Path] = None) -> Optional[StyleTargets]:
+        """The painting to measure against, where the method has one and it is still there.
+
+        Args:
+            style_image: another one than that of the run.
+        """
         return None
+
+    def held_out_report(
+        self, style_image: Optional[Path] = None, baked: bool = False, picture_folder: Optional[Path] = None
+    ) -> HeldOutReport:
+        """What `sparsestyle evaluate` measures; see `evaluate_held_out`."""
+        views, cameras = self.datamanager.eval_dataset, self.datamanager.train_dataset.cameras
+        targets = self.style_targets(style_image)
+        return evaluate_held_out(self.model, views, cameras, targets, baked, picture_folder)
 
     @exit_on_input_error
     def get_average_eval_image_metrics(
         self, step: Optional[int] = None, output_path: Optional[Path] = None, get_std: bool = False
     ) -> Dict[str, float]:
         """The figures of `sparsestyle evaluate`, for `ns-eval`, with the time that rendering took."""
-        from sparsestyle_ns.evaluation.held_out import evaluate_held_out
-
         self.eval()
-        report = evaluate_held_out(self, self.painting(), picture_folder=output_path)
+        report = self.held_out_report(picture_folder=output_path)
         self.train()
         return {**report.means, **(report.deviations() if get_std else {}), **report.speed()}
 

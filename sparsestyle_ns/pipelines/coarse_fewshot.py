@@ -13,7 +13,6 @@ from sparsestyle_ns.effects.registry import decide_again
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel, CoarseFewShotModelConfig
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
 from sparsestyle_ns.pipelines.unseen_views import UnseenViews
-from sparsestyle_ns.style.painting import SMALLEST_SIDE
 from sparsestyle_ns.utils.errors import InputError
 
 
@@ -42,8 +41,6 @@ class CoarseFewShotPipelineConfig(CheckedPipelineConfig):
             raise InputError(f"--pipeline.semantic-weight is {self.semantic_weight}; give a number from 0 on.")
         if self.semantic_every < 1:
             raise InputError(f"--pipeline.semantic-every is {self.semantic_every}; give 1 or more.")
-        if self.semantic_side < SMALLEST_SIDE:
-            raise InputError(f"--pipeline.semantic-side is {self.semantic_side}; give {SMALLEST_SIDE} or more pixels.")
 
 
 class CoarseFewShotPipeline(CheckedPipeline):
@@ -76,11 +73,13 @@ class CoarseFewShotPipeline(CheckedPipeline):
         cameras, pixels = self.datamanager.train_dataset.cameras, self.datamanager.pixels
         if len(cameras) < 2:
             raise InputError("--pipeline.semantic-weight needs views between photos, and there is one; train on more.")
-        backbone = self.config.load_backbone(self.device)
+        backbone, side = self.config.load_backbone(self.device), self.config.semantic_side
+        if side < backbone.smallest_side:
+            raise InputError(f"--pipeline.semantic-side is {side}; give {backbone.smallest_side} or more pixels.")
         self.announce(backbone)
         colors = pixels.colors.tensor_split(pixels.starts[1:-1])
         photos = [rows.view(*size, 3) for rows, size in zip(colors, pixels.sizes, strict=True)]
-        return UnseenViews(backbone, cameras, photos, self.config.semantic_side)
+        return UnseenViews(backbone, cameras, photos, side)
 
     def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Any], Dict[str, Tensor], Dict[str, Any]]:
         """Outputs, losses and metrics of a batch and, every `semantic_every` iterations, the loss of an unseen view.

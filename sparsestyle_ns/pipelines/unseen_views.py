@@ -16,7 +16,7 @@ from sparsestyle_ns.losses.semantic import pooled_features, semantic_loss
 from sparsestyle_ns.losses.stylization import fit_side
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.pipelines.datamanager import bundle_rays
-from sparsestyle_ns.style.vgg import VGGFeatures
+from sparsestyle_ns.style.backbone import Backbone
 
 NUM_PLACES = 240
 """Places that a view is drawn from, at least."""
@@ -34,9 +34,7 @@ class UnseenViews:
         side: longer side, in pixels, at which views are rendered, and the network sees them and the photos.
     """
 
-    def __init__(
-        self, backbone: VGGFeatures, cameras: Cameras, photos: List[Float[Tensor, "H W 3"]], side: int
-    ) -> None:
+    def __init__(self, backbone: Backbone, cameras: Cameras, photos: List[Float[Tensor, "H W 3"]], side: int) -> None:
         self.backbone = backbone
         self.side = side
         places = unseen_places(cameras, NUM_PLACES)
@@ -48,7 +46,9 @@ class UnseenViews:
 
     def embedding(self, picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 C"]:
         """What the network says that a picture shows."""
-        return pooled_features(self.backbone(fit_side(picture.permute(2, 0, 1)[None], self.side)))
+        return pooled_features(
+            self.backbone(fit_side(picture.permute(2, 0, 1)[None], self.side, self.backbone.smallest_side))
+        )
 
     def loss(self, model: CoarseFewShotModel, generator: torch.Generator) -> Float[Tensor, ""]:
         """The loss of one view, rendered as training rays are, at the exposure of the photo that it is held against.

@@ -11,7 +11,7 @@ from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
 from sparsestyle_ns.runs.scene_record import record_scene
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.style.painting import Painting
 
 
 def measure_scene(
@@ -45,5 +45,5 @@ def measure_scene(
         check_scene(run, record_scene(data, manager.train_dataparser_outputs, effects))
         scene.coarse_density = run.density(effects)
     if style_image is not None:
-        scene.style_image = load_style_image(style_image)
+        scene.style_image = Painting.read(style_image).pixels
     return decide(scene, EffectSettings(), effects)

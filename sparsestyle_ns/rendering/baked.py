@@ -11,7 +11,6 @@ picture with logarithms, 40.2 dB with densities; bytes instead of floats cost 0.
 """
 
 import math
-from dataclasses import dataclass
 from typing import Callable, Optional, Tuple
 
 import numpy as np
@@ -20,17 +19,23 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from sparsestyle_ns.core.occupancy import Occupancy
+from sparsestyle_ns.core.precision import Precision, autocast
 from sparsestyle_ns.core.sampling import even_edges
-from sparsestyle_ns.core.spaces import MAX_DISTANCE, ContractedSegments, LinearSegments, Segments, spacing
+from sparsestyle_ns.core.spaces import (
+    MAX_DISTANCE,
+    ContractedSegments,
+    ForwardFacingSpace,
+    LinearSegments,
+    Segments,
+    Space,
+    spacing,
+)
+from sparsestyle_ns.fields.coarse import CoarseField
+from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.rendering import baked_kernels
 from sparsestyle_ns.rendering.mixing import STYLISED, Appearance, Mix, mixed
-from sparsestyle_ns.rendering.render import (
-    POINTS_PER_CALL,
-    PackedRender,
-    composite,
-    render_packed,
-    visible_samples,
-)
+from sparsestyle_ns.rendering.render import POINTS_PER_CALL, PackedRender, composite, render_packed
+from sparsestyle_ns.rendering.visible_samples import Marching, visible_samples
 from sparsestyle_ns.utils.numba_kernels import even_parts, run_on_threads
 
 Shade = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points 8"]]
@@ -50,6 +55,9 @@ DENSITY_STEP = math.log1p(MAX_DENSITY / DENSITY_UNIT) / 254
 ROUNDING = 1e-3
 """Part of a code's step that interpolation may be off; less than that above the code of 0 is 0 (an infinite interval
 makes anything else opaque)."""
+AHEAD = ((0.0, 0.0, -1.0),)
+"""Where cameras of a forward-facing scene look."""
+ALL_AROUND = ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
 RAYS_PER_PART = 512
 """Rays that a thread marches before it takes the next part: they end early or late, and threads shouldn't wait."""
 
@@ -67,6 +75,28 @@ def decode(codes: Float[Tensor, "points 8"]) -> Float[Tensor, "points 8"]:
     steps = codes[:, :NUM_DENSITIES] - 1.0
     density = torch.where(steps > ROUNDING, DENSITY_UNIT * torch.expm1(DENSITY_STEP * steps), 0.0)
     return torch.cat([density, codes[:, NUM_DENSITIES:] / 255.0], dim=-1)
+
+
+def shade_of(field: CoarseField, style: StylisedField, space: Space, precision: Precision) -> Shade:
+    """The two fields as they are whenever it is called.
+
+    c_c, where it depends on the view direction, is that of a camera that looks straight ahead in a forward-facing
+    scene, and elsewhere the mean over the directions of the axes; c_f and the densities depend on no direction.
+    """
+    seen_from = ALL_AROUND
+    if field.direction_encoding is None or isinstance(space, ForwardFacingSpace):
+        seen_from = AHEAD
+
+    def shade(points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 8"]:
+        with autocast(points.device, precision):
+            density, feature = field.density_and_feature(points)
+            feature = feature.float()
+            fine_density, fine_color = style(style.locate(points), feature, density)
+            colors = [field.color(feature, points.new_tensor(way).expand_as(points)) for way in seen_from]
+            color = torch.stack(colors).mean(dim=0)
+        return torch.cat([density[:, None], fine_density[:, None], fine_color, color], dim=-1)
+
+    return shade
 
 
 class BakedVolume:
@@ -165,25 +195,6 @@ def _unravel(index: Int[Tensor, "points"], size: int) -> Int[Tensor, "points 3"]
     return torch.stack([index // size**2, index // size % size, index % size], dim=-1)
 
 
-@dataclass
-class Rays:
-    """All that rendering needs of a batch of rays and of the space they cross, but the fields.
-
-    Attributes:
-        segments: the rays.
-        occupancy: which cells are empty; None: none is.
-        num_steps: even steps along a ray.
-        unbounded: whether the last step goes on to infinity.
-        min_transmittance: share of light left below which a ray ends.
-    """
-
-    segments: Segments
-    occupancy: Optional[Occupancy]
-    num_steps: int
-    unbounded: bool
-    min_transmittance: float
-
-
 ONE_CELL = np.ones((1, 1, 1), dtype=bool)
 """The kernels' grid where nothing is skipped."""
 
@@ -191,7 +202,8 @@ ONE_CELL = np.ones((1, 1, 1), dtype=bool)
 @torch.no_grad()
 def render_baked(
     volume: BakedVolume,
-    rays: Rays,
+    segments: Segments,
+    marching: Marching,
     background: Optional[Float[Tensor, "3"]],
     mix: Mix = STYLISED,
     second: Optional[BakedVolume] = None,
@@ -203,25 +215,24 @@ def render_baked(
         second: of another style, with the same coarse field and resolution.
     """
     march = march_compiled if volume.codes.device.type == "cpu" else march_in_torch
-    return march(volume, rays, background, mix, second)
+    return march(volume, segments, marching, background, mix, second)
 
 
 @torch.no_grad()
 def march_in_torch(
     volume: BakedVolume,
-    rays: Rays,
+    segments: Segments,
+    marching: Marching,
     background: Optional[Float[Tensor, "3"]],
     mix: Mix = STYLISED,
     second: Optional[BakedVolume] = None,
 ) -> Tuple[PackedRender, PackedRender]:
     """`render_baked` on any device: the exact render, with the volumes in the fields' place."""
-    samples, density, values = visible_samples(
-        volume, rays.occupancy, rays.segments, rays.num_steps, rays.unbounded, rays.min_transmittance
-    )
+    samples, density, values = visible_samples(volume, segments, marching)
     coarse, styles = Appearance(density, values[:, 4:]), [_style(values)]
     if second is not None:
         styles.append(_style(second.density_and_feature(samples.positions)[1]))
-    num_rays = len(rays.segments.hit)
+    num_rays = len(segments.hit)
     render = render_packed(samples, num_rays, *mixed(coarse, styles, mix), background)
     return render, render_packed(samples, num_rays, *coarse, background)
 
@@ -233,20 +244,21 @@ def _style(feature: Float[Tensor, "points 7"]) -> Appearance:
 @torch.no_grad()
 def march_compiled(
     volume: BakedVolume,
-    rays: Rays,
+    segments: Segments,
+    marching: Marching,
     background: Optional[Float[Tensor, "3"]],
     mix: Mix = STYLISED,
     second: Optional[BakedVolume] = None,
 ) -> Tuple[PackedRender, PackedRender]:
     """`render_baked` on a CPU: rays are marched until none has come by a voxel that isn't filled."""
-    lines = _lines(rays)
+    lines = _lines(segments, marching)
     left = torch.arange(len(lines.hit))
     sums = torch.zeros(len(left), 10)
     shares = tuple(map(np.float32, (mix.density_share, mix.strength, mix.blend)))
     while len(left):
         missing = torch.full((len(left), baked_kernels.LOOKAHEAD), baked_kernels.NO_CELL)
-        fields = _voxels(volume, rays.occupancy), None if second is None else _voxels(second, rays.occupancy), shares
-        results = (lines, *fields, np.float32(rays.min_transmittance), sums.numpy(), missing.numpy())
+        voxels = [None if each is None else _voxels(each, marching.occupancy) for each in (volume, second)]
+        results = (lines, *voxels, shares, np.float32(marching.min_transmittance), sums.numpy(), missing.numpy())
         parts = even_parts(len(left), -(-len(left) // RAYS_PER_PART))
         run_on_threads(baked_kernels.march_rays, [(left.numpy(), *part, *results) for part in parts])
         found = missing != baked_kernels.NO_CELL
@@ -270,9 +282,8 @@ def _voxels(volume: BakedVolume, occupancy: Optional[Occupancy]) -> baked_kernel
     )
 
 
-def _lines(rays: Rays) -> baked_kernels.Lines:
+def _lines(segments: Segments, marching: Marching) -> baked_kernels.Lines:
     """Segments in the kernels' form."""
-    segments = rays.segments
     spaced = torch.zeros(2)
     if isinstance(segments, ContractedSegments):
         parts = segments.origins, segments.directions
@@ -286,7 +297,7 @@ def _lines(rays: Rays) -> baked_kernels.Lines:
         values=torch.cat(parts, dim=-1).float().numpy(),
         hit=segments.hit.numpy(),
         bent=isinstance(segments, ContractedSegments),
-        unbounded=rays.unbounded,
+        unbounded=marching.unbounded,
         spaced=spaced.numpy(),
-        edges=even_edges(1, rays.num_steps, segments.hit.device)[0].numpy(),
+        edges=even_edges(1, marching.num_steps, segments.hit.device)[0].numpy(),
     )

@@ -1,52 +1,56 @@
-"""Volume rendering of the two fields: segments and fields in, pixels out."""
+"""Volume rendering of the fields: segments and fields in, pixels out."""
 
 from dataclasses import dataclass
-from typing import List, Optional, Sequence, Tuple
+from typing import Optional, Sequence, Tuple
 
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor, nn
+from jaxtyping import Float
+from torch import Tensor
 
-from sparsestyle_ns.core.occupancy import Occupancy, PackedSamples, interval_lengths, march
+from sparsestyle_ns.core.occupancy import PackedSamples, interval_lengths
 from sparsestyle_ns.core.spaces import Segments
-from sparsestyle_ns.core.volrend import (
-    dense_weights,
-    optical_depth,
-    packed_sum,
-    packed_weights,
-)
+from sparsestyle_ns.core.volrend import dense_weights, optical_depth, packed_sum, packed_weights
 from sparsestyle_ns.field_components.hash_grid import GridLocation
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
 from sparsestyle_ns.fields.coarse import CoarseField
-from sparsestyle_ns.fields.residual import ResidualField
+from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.rendering.mixing import STYLISED, Appearance, Mix, mixed
+from sparsestyle_ns.rendering.visible_samples import Marching, visible_samples
+
+POINTS_PER_CALL = 1 << 17
+"""Points at which a frozen field is evaluated at once; bounds the memory of its hidden layers."""
+NO_WEIGHT = 1e-10
+"""Rays with an accumulation of at most this have no surface and no colour."""
 
 
 @dataclass
-class DenseRender:
-    """What `render_coarse` finds on each ray.
+class PackedRender:
+    """Pixels.
 
     Attributes:
         rgb: colour, background included.
         accumulation: Σw, the share of the ray that is not background.
-        s: where the ray's weight lies on average, in [0, 1].
-        weights: w of each sample.
-        density: σ of each sample.
-        positions: field coordinates of each sample.
+        s: where the ray's weight lies on average, in [0, 1]; 1 without weight.
     """
 
     rgb: Float[Tensor, "rays 3"]
     accumulation: Float[Tensor, "rays 1"]
     s: Float[Tensor, "rays 1"]
+
+
+@dataclass
+class DenseRender(PackedRender):
+    """Pixels of the coarse field, with the samples that its losses are of.
+
+    Attributes:
+        weights: w of each sample.
+        density: σ of each sample.
+        positions: field coordinates of each sample.
+    """
+
     weights: Float[Tensor, "rays samples"]
     density: Float[Tensor, "rays samples"]
     positions: Float[Tensor, "rays samples 3"]
-
-
-POINTS_PER_CALL = 1 << 17
-"""Points at which a frozen field is evaluated at once; bounds the memory of its hidden layers."""
-SAMPLES_PER_PASS = 6
-"""Samples of a ray that are evaluated before looking whether it goes on."""
 
 
 def seen_behind(
@@ -71,13 +75,22 @@ def straight_color(
     Black where a ray has no weight.
     """
     own = rgb if background is None else rgb - (1.0 - accumulation) * background
-    return torch.where(accumulation > 1e-10, own / accumulation.clamp(min=1e-10), 0.0).clamp(0.0, 1.0)
+    color = torch.where(accumulation > NO_WEIGHT, own / accumulation.clamp(min=NO_WEIGHT), 0.0)
+    return color.clamp(0.0, 1.0)
 
 
 def mean_position(weights: Float[Tensor, "rays samples"], s: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays 1"]:
     """Σ w s / Σ w; 1, the segment's end, where a ray has no weight."""
-    total = weights.sum(dim=-1, keepdim=True)
-    return torch.where(total > 1e-10, (weights * s).sum(dim=-1, keepdim=True) / total.clamp(min=1e-10), 1.0)
+    return _mean((weights * s).sum(dim=-1, keepdim=True), weights.sum(dim=-1, keepdim=True))
+
+
+def _mean(moment: Float[Tensor, "rays 1"], total: Float[Tensor, "rays 1"]) -> Float[Tensor, "rays 1"]:
+    return torch.where(total > NO_WEIGHT, moment / total.clamp(min=NO_WEIGHT), 1.0)
+
+
+def surface_distance(segments: Segments, s: Float[Tensor, "rays 1"]) -> Float[Tensor, "rays 1"]:
+    """Depth pictures: distance of s from the camera, in world units; s = 1 may be infinitely far, so a bit less."""
+    return segments.distance(s.clamp(max=1.0 - 1e-4))
 
 
 def render_coarse(
@@ -100,20 +113,13 @@ def render_coarse(
     color = field.color(feature, directions[:, None].expand_as(positions))
     weights = dense_weights(optical_depth(density, interval_lengths(segments, edges, unbounded)))
     accumulation = weights.sum(dim=-1, keepdim=True)
-    rgb = (weights[..., None] * color).sum(dim=-2)
-    return DenseRender(
-        rgb=over_background(rgb, accumulation, background),
-        accumulation=accumulation,
-        s=mean_position(weights, middle),
-        weights=weights,
-        density=density,
-        positions=positions,
-    )
+    rgb = over_background((weights[..., None] * color).sum(dim=-2), accumulation, background)
+    return DenseRender(rgb, accumulation, mean_position(weights, middle), weights, density, positions)
 
 
 @dataclass
 class FrozenSamples:
-    """All that the residual field needs of a batch of rays and that training it doesn't change.
+    """All that the stylised field needs of a batch of rays and that training it doesn't change.
 
     Attributes:
         samples: where the samples are.
@@ -138,71 +144,11 @@ class FrozenSamples:
 
 @torch.no_grad()
 def freeze_samples(
-    field: CoarseField,
-    residual: ResidualField,
-    occupancy: Optional[Occupancy],
-    segments: Segments,
-    num_steps: int,
-    unbounded: bool,
-    min_transmittance: float,
+    field: CoarseField, stylised: StylisedField, segments: Segments, marching: Marching
 ) -> FrozenSamples:
     """Finds the samples of a batch of rays that can show, and evaluates the frozen coarse field there."""
-    samples, density, feature = visible_samples(field, occupancy, segments, num_steps, unbounded, min_transmittance)
-    return FrozenSamples(samples, density, feature, residual.locate(samples.positions), len(segments.hit))
-
-
-def visible_samples(
-    field: CoarseField,
-    occupancy: Optional[Occupancy],
-    segments: Segments,
-    num_steps: int,
-    unbounded: bool,
-    min_transmittance: float,
-) -> Tuple[PackedSamples, Float[Tensor, "samples"], Float[Tensor, "samples feature"]]:
-    """The samples of a batch of rays that can show, and σ_c and e_c there.
-
-    Samples lie in occupied cells, where a grid says which are, and in front of them at least `min_transmittance` of the
-    light is left.
-    """
-    samples = march(segments, occupancy, num_steps, unbounded)
-    index, density, feature = evaluate_front_to_back(field, samples, len(segments.hit), min_transmittance)
-    return samples.select(index), density, feature
-
-
-def evaluate_front_to_back(
-    field: CoarseField, samples: PackedSamples, num_rays: int, min_transmittance: float
-) -> Tuple[Int[Tensor, "seen"], Float[Tensor, "seen"], Float[Tensor, "seen feature"]]:
-    """σ_c and e_c of those packed samples in front of which more than `min_transmittance` of the light is left.
-
-    A few samples of each ray are evaluated at a time, and none of a ray that has ended.
-
-    The same samples come out each time, on a GPU too: a view that is frozen again in the backward pass has to have
-    them. So depths aren't added up by threads that race, as `index_add_` and sums over all samples are there.
-
-    Returns:
-        Which samples these are, ascending, and σ_c and e_c there.
-    """
-    on_ray = samples.ray_indices
-    counts = torch.bincount(on_ray, minlength=num_rays)
-    rank = torch.arange(len(on_ray), device=on_ray.device) - (torch.cumsum(counts, dim=0) - counts)[on_ray]
-    depth = samples.s.new_zeros(num_rays)
-    found: List[Tuple[Tensor, Tensor, Tensor]] = []
-    for first in range(0, max(1, int(counts.max())), SAMPLES_PER_PASS):
-        goes_on = torch.exp(-depth) > min_transmittance
-        in_pass = (rank >= first) & (rank < first + SAMPLES_PER_PASS) & goes_on[on_ray]
-        index = in_pass.nonzero().squeeze(-1)
-        density, feature = field.density_and_feature(samples.positions[index])
-        place = on_ray[index], rank[index] - first
-        depths = depth.new_zeros(num_rays, SAMPLES_PER_PASS)
-        depths[place] = optical_depth(density, samples.lengths[index])
-        behind = depth[:, None] + depths.cumsum(dim=1)
-        in_front = torch.cat([depth[:, None], behind[:, :-1]], dim=1)
-        seen = torch.exp(-in_front)[place] > min_transmittance
-        depth = behind[:, -1]
-        found.append((index[seen], density[seen], feature[seen].float()))
-    index, density, feature = (torch.cat(parts) for parts in zip(*found, strict=True))
-    order = torch.argsort(index)
-    return index[order], density[order], feature[order]
+    samples, density, feature = visible_samples(field, segments, marching)
+    return FrozenSamples(samples, density, feature, stylised.locate(samples.positions), len(segments.hit))
 
 
 def accumulation_of(frozen: FrozenSamples) -> Float[Tensor, "rays 1"]:
@@ -210,15 +156,6 @@ def accumulation_of(frozen: FrozenSamples) -> Float[Tensor, "rays 1"]:
     depth = optical_depth(frozen.density, frozen.samples.lengths)
     weights = packed_weights(depth, frozen.samples.ray_indices, frozen.num_rays)
     return packed_sum(weights[:, None], frozen.samples.ray_indices, frozen.num_rays)
-
-
-@dataclass
-class PackedRender:
-    """What `render_stylised` finds on each ray: colour with background, Σw, and where the weight lies on average."""
-
-    rgb: Float[Tensor, "rays 3"]
-    accumulation: Float[Tensor, "rays 1"]
-    s: Float[Tensor, "rays 1"]
 
 
 def render_packed(
@@ -237,21 +174,20 @@ def render_packed(
 def composite(sums: Float[Tensor, "rays 5"], background: Optional[Float[Tensor, "3"]]) -> PackedRender:
     """Pixels from a ray's sums of w times colour, of w, and of w times s."""
     rgb, accumulation, moment = sums.split([3, 1, 1], dim=-1)
-    s = torch.where(accumulation > 1e-10, moment / accumulation.clamp(min=1e-10), 1.0)
-    return PackedRender(over_background(rgb, accumulation, background), accumulation, s)
+    return PackedRender(over_background(rgb, accumulation, background), accumulation, _mean(moment, accumulation))
 
 
 def render_stylised(
-    residual: ResidualField,
+    stylised: StylisedField,
     frozen: FrozenSamples,
     background: Optional[Float[Tensor, "3"]],
     coarse_geometry: bool = False,
 ) -> PackedRender:
-    """Renders σ_f and c_f (Eq. 2 and 3) at frozen samples; differentiable in the residual field.
+    """Renders σ_f and c_f (Eq. 2 and 3) at frozen samples; differentiable in the stylised field.
 
     With `coarse_geometry`, σ_c takes the place of σ_f.
     """
-    density, color = residual(frozen.location, frozen.feature, frozen.density)
+    density, color = stylised(frozen.location, frozen.feature, frozen.density)
     if coarse_geometry:
         density = frozen.density
     return render_packed(frozen.samples, frozen.num_rays, density, color, background)
@@ -260,7 +196,7 @@ def render_stylised(
 @torch.no_grad()
 def render_mixed(
     field: CoarseField,
-    styles: Sequence[nn.Module],
+    styles: Sequence[StylisedField],
     frozen: FrozenSamples,
     directions: Float[Tensor, "rays 3"],
     background: Optional[Float[Tensor, "3"]],
@@ -269,7 +205,7 @@ def render_mixed(
     """The render of a mixture of the fields, by default the stylised one, and the coarse render, at frozen samples.
 
     Args:
-        styles: one or two fields that give σ_f and c_f, as `ResidualField` does.
+        styles: one or two fields that give σ_f and c_f.
         mix: how much of each field counts.
     """
     coarse = Appearance(frozen.density, field.color(frozen.feature, directions[frozen.samples.ray_indices]))

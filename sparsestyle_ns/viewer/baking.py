@@ -6,15 +6,18 @@ one that sees it again doesn't. So the time in which nobody moves anything goes 
 
 import threading
 import time
-from typing import Any, Callable, ContextManager, Iterator, List, Optional, Set, Tuple
+from contextlib import AbstractContextManager
+from typing import Callable, Iterator, List, Optional, Set, Tuple
 from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.camera_utils import get_interpolated_poses
 from nerfstudio.cameras.cameras import Cameras
-from torch import Tensor, nn
+from torch import Tensor
 
+from sparsestyle_ns.fields.fine import StylisedField
+from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.rendering.baked import BakedVolume
 
 SIDE = 252
@@ -50,7 +53,7 @@ class Baker(threading.Thread):
     """Fills the volumes of the styles that are shown, for as long as there is something to fill and time for it.
 
     Args:
-        model: the `HierStyleModel`.
+        model: whose volumes these are.
         cameras: of the photos.
         shown: the styles on the screen.
         is_free: whether the processor has nothing else to do.
@@ -59,11 +62,11 @@ class Baker(threading.Thread):
 
     def __init__(
         self,
-        model: Any,
+        model: HierStyleModel,
         cameras: Cameras,
-        shown: Callable[[], Tuple[nn.Module, ...]],
+        shown: Callable[[], Tuple[StylisedField, ...]],
         is_free: Callable[[], bool],
-        lock: ContextManager,
+        lock: AbstractContextManager,
     ) -> None:
         super().__init__(name="baking", daemon=True)
         self.model, self.shown, self.is_free, self.lock = model, shown, is_free, lock
@@ -86,17 +89,17 @@ class Baker(threading.Thread):
         """Whether all is filled that the styles on the screen need."""
         return self._next() is None
 
-    def _next(self) -> Optional[Tuple[nn.Module, int]]:
+    def _next(self) -> Optional[Tuple[StylisedField, int]]:
         """A style on the screen, and the number of a camera that its volume isn't filled for."""
         filled = [(style, self._filled_for(style)) for style in self.shown()]
         numbers = range(len(self.cameras))
         return next(((style, number) for number in numbers for style, known in filled if number not in known), None)
 
-    def _filled_for(self, style: nn.Module) -> Set[int]:
-        volume = self.model.kept_volume(style)
+    def _filled_for(self, style: StylisedField) -> Set[int]:
+        volume = self.model.baked.kept(style)
         return set() if volume is None else self.filled.get(volume, set())
 
-    def _fill(self, style: nn.Module, number: int) -> None:
+    def _fill(self, style: StylisedField, number: int) -> None:
         """Follows a camera's rays, as long as the style is shown and its volume stays the same."""
         followed: Optional[BakedVolume] = None
         for rays in _rays(self.cameras[number], self.model.device):
@@ -107,7 +110,7 @@ class Baker(threading.Thread):
         self.filled.setdefault(followed, set()).add(number)
 
     @torch.no_grad()
-    def _follow(self, style: nn.Module, origins: Tensor, directions: Tensor) -> Optional[BakedVolume]:
+    def _follow(self, style: StylisedField, origins: Tensor, directions: Tensor) -> Optional[BakedVolume]:
         """Fills what these rays meet, once there is time, and returns in which volume; None where the style isn't
         shown any more, or it is to end."""
         while not self.is_free() and not self.ending.wait(0.1):
@@ -115,8 +118,8 @@ class Baker(threading.Thread):
         if self.ending.is_set() or style not in self.shown():
             return None
         with self.lock:
-            self.model.fill_baked(origins, directions, style)
-            volume = self.model.kept_volume(style)
+            self.model.render_baked(self.model.space.segments(origins, directions), (style,))
+            volume = self.model.baked.kept(style)
         time.sleep(0.005)  # whoever waits for the lock gets it
         return volume
 

@@ -1,25 +1,33 @@
-"""The table of effects in the viewer."""
+"""The viewer's list of effects, for a run of `coarse-fewshot`."""
 
-from typing import Callable
+from pathlib import Path
 
-from nerfstudio.viewer.viewer_elements import ViewerElement
-from viser import ViserServer
+from nerfstudio.viewer.viewer import Viewer
+from nerfstudio.viewer.viewer_elements import ViewerControl
+
+from sparsestyle_ns.pipelines.base import CheckedPipeline
+from sparsestyle_ns.viewer.texts import effects_text
 
 
-class EffectsPanel(ViewerElement[str]):
-    """A table of text in the viewer's list of controls.
+def add_effects(viewer: Viewer, pipeline: CheckedPipeline) -> None:
+    """Adds a folder that says which effects of a scene are simulated, and why."""
+    gui = viewer.viser_server.gui
+    with gui.add_folder("Effects of this scene", expand_by_default=False):
+        # viser warns where it is given no folder of pictures; there are none here.
+        gui.add_markdown(effects_text(pipeline.effects), image_root=Path())
+
+
+class EffectsPanel(ViewerControl):
+    """The effects of a scene, in a folder of their own.
 
     Args:
-        markdown: gives the text whenever the panel is made.
+        pipeline: of the run.
     """
 
-    def __init__(self, markdown: Callable[[], str]) -> None:
-        super().__init__("Effects")
-        self.markdown = markdown
+    def __init__(self, pipeline: CheckedPipeline) -> None:
+        self.pipeline = pipeline
 
-    def _create_gui_handle(self, viser_server: ViserServer) -> None:
-        self.gui_handle = viser_server.gui.add_markdown(self.markdown(), visible=self.visible)
-
-    def install(self, viser_server: ViserServer) -> None:
-        """Makes the panel."""
-        self._create_gui_handle(viser_server)
+    def _setup(self, viewer: Viewer) -> None:
+        """Called by nerfstudio when everything else of the viewer is there; see `ViewerControl`."""
+        super()._setup(viewer)
+        add_effects(viewer, self.pipeline)

@@ -2,6 +2,8 @@
 
 import io
 import json
+import os
+import shutil
 import socket
 import stat
 import subprocess
@@ -97,7 +99,7 @@ def fails(tmp_path, capsys):
         assert captured.err.count("\n") == 1
         assert "Traceback" not in captured.err
         assert contents(tmp_path) == before
-        assert not output.is_dir() or not list(output.glob(".fetch-*"))
+        assert not output.is_dir() or not list(output.glob(".unfinished-*"))
         return captured.err
 
     return run
@@ -156,14 +158,14 @@ def test_an_existing_scene_survives_a_failed_replacement(server, tmp_path, fails
 def test_the_old_scene_comes_back_if_the_new_one_cannot_be_moved_in(tmp_path, fails, monkeypatch):
     (tmp_path / "data" / "fern").mkdir(parents=True)
     (tmp_path / "data" / "fern" / "mine.txt").write_text("mine")
-    replace = _download.os.replace
+    replace = os.replace
 
     def refuse_new_scene(source, target):
-        if Path(source).name == "scene":
+        if Path(source).name == "new":
             raise PermissionError(13, "Permission denied")
         replace(source, target)
 
-    monkeypatch.setattr(_download.os, "replace", refuse_new_scene)
+    monkeypatch.setattr(os, "replace", refuse_new_scene)
     assert "Permission denied" in fails("--url", write(tmp_path / "good.zip", LLFF_ZIP), "--force")
 
 
@@ -252,7 +254,7 @@ def test_a_disk_that_fills_up_is_reported(tmp_path, fails, monkeypatch):
     def disk_full(*arguments):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(_download.shutil, "copyfileobj", disk_full)
+    monkeypatch.setattr(shutil, "copyfileobj", disk_full)
     assert "No space left on device" in fails("--url", write(tmp_path / "good.zip", LLFF_ZIP))
 
 

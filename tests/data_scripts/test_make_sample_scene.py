@@ -9,23 +9,19 @@ import cv2
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-from make_sample_scene import (
-    BLENDER_CAMERA_ANGLE_X,
-    Box,
-    Scene,
-    Sphere,
-    ValueNoise,
+from make_sample_scene import main
+from sample_scene.cameras import (
     circling_cameras,
     forward_facing_cameras,
     look_at,
-    main,
-    objects_on_a_plinth,
-    photo_gains,
-    poses_bounds_row,
-    render_sample,
-    still_life,
+    rays_of_rows,
     surrounding_cameras,
 )
+from sample_scene.scene import Scene, objects_on_a_plinth, still_life
+from sample_scene.shapes import Box, Sphere
+from sample_scene.textures import ValueNoise
+from sample_scene.tracer import render_sample
+from sample_scene.writers import BLENDER_CAMERA_ANGLE_X, photo_gains, poses_bounds_row
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 102.0
 NUM_VIEWS = 4
@@ -50,7 +46,7 @@ def blender(tmp_path_factory):
 def two_views():
     """The outermost cameras of a row of the grid, with what they see: (pose, rgb, depth) each."""
     poses = forward_facing_cameras(20)[[5, 9]]
-    renders = [render_sample(pose, FOCAL, HEIGHT, WIDTH) for pose in poses]
+    renders = [render_sample(pose, FOCAL, HEIGHT, WIDTH, still_life()) for pose in poses]
     return [(pose, rgb, depth) for pose, (rgb, _, depth) in zip(poses, renders, strict=True)]
 
 
@@ -110,7 +106,7 @@ def test_depths_never_lie_behind_what_the_other_camera_proves_to_be_empty(two_vi
 def test_depth_at_a_balls_centre_is_its_distance_less_its_radius_along_the_viewing_axis():
     ball = next(shape for shape in still_life().shapes if isinstance(shape, Sphere))
     pose = look_at((0.1, -0.2, 1.4), (0.0, 5.0, 0.9))
-    *_, depth = render_sample(pose, FOCAL, HEIGHT, WIDTH, supersample=1)
+    *_, depth = render_sample(pose, FOCAL, HEIGHT, WIDTH, still_life(), supersample=1)
     x, y, z = project(pose, np.array(ball.centre), FOCAL, HEIGHT, WIDTH)
     distance = np.linalg.norm(np.array(ball.centre) - pose[:3, 3])
     # Half a pixel off the centre, the ball's surface is less than 0.1% farther away.
@@ -201,7 +197,7 @@ def test_the_objects_lie_within_the_unit_cube_and_fill_much_of_it():
 
 def test_a_pixel_needs_an_odd_number_of_rays_so_that_depth_is_of_its_centre():
     with pytest.raises(ValueError, match="odd"):
-        render_sample(np.eye(4), FOCAL, 4, 4, supersample=2)
+        render_sample(np.eye(4), FOCAL, 4, 4, still_life(), supersample=2)
 
 
 def test_a_camera_that_looks_straight_down_is_refused():
@@ -249,7 +245,7 @@ def test_pictures_show_what_the_written_poses_and_bounds_say(llff):
         picture = imageio.imread(path)
         assert picture.shape == (height, width, 3) == (48, 64, 3)
         pose = np.stack([right, -down, back, position], axis=1)
-        rgb, _, depth = render_sample(pose, focal, int(height), int(width))
+        rgb, _, depth = render_sample(pose, focal, int(height), int(width), still_life())
         np.testing.assert_allclose(picture / 255, rgb, atol=0.5 / 255 + 1e-6)
         assert near < depth.min() < 1.2 * near
         assert far == pytest.approx(depth.max())
@@ -257,9 +253,8 @@ def test_pictures_show_what_the_written_poses_and_bounds_say(llff):
 
 def test_the_grid_reaches_a_quarter_of_the_nearest_depth_to_either_side():
     poses = forward_facing_cameras(20)
-    nearest = min(
-        render_sample(pose, FOCAL, HEIGHT, WIDTH, supersample=1)[2].min() for pose in poses[[0, 2, 4, 15, 17, 19]]
-    )
+    outermost = poses[[0, 2, 4, 15, 17, 19]]
+    nearest = min(render_sample(pose, FOCAL, HEIGHT, WIDTH, still_life(), 1)[2].min() for pose in outermost)
     reach = np.ptp(poses[:, 0, 3]) / 2
     assert 0.2 < reach / nearest < 0.33
     assert np.ptp(poses[:, 2, 3]) > 0.5 * reach
@@ -372,7 +367,6 @@ def test_what_shines_looks_different_from_elsewhere_and_only_brighter(two_views)
 
 def test_a_bent_lens_sees_along_the_rays_that_nerfstudio_makes_of_its_parameters(tmp_path):
     import torch
-    from make_sample_scene import _band_of_rays
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
     options = ["--width", "24", "--num-views", "9", "--supersample", "1", "--distortion", "0.3"]
@@ -382,7 +376,7 @@ def test_a_bent_lens_sees_along_the_rays_that_nerfstudio_makes_of_its_parameters
     assert [path.name for path in outputs.image_filenames] == [f"image{i:03d}.png" for i in range(1, 8)]
     found = outputs.cameras.generate_rays(camera_indices=0, keep_shape=True).directions
     pose = outputs.cameras.camera_to_worlds[0].numpy()
-    expected, _ = _band_of_rays(pose, float(outputs.cameras.fx[0]), 18, 24, np.arange(18), 1, 0.3)
+    expected, _ = rays_of_rows(pose, float(outputs.cameras.fx[0]), 18, 24, np.arange(18), 1, 0.3)
     # nerfstudio inverts the lens in float32 up to 1e-3.
     torch.testing.assert_close(found.reshape(-1, 3), torch.from_numpy(expected.T).float(), atol=2e-3, rtol=0)
 
@@ -397,7 +391,7 @@ def test_distortion_is_refused_where_the_layout_has_no_place_for_it(tmp_path):
 def test_mist_takes_light_by_the_length_of_its_way(two_views):
     pose, _, _ = two_views[0]
     # One ray a pixel: a pixel's way is its depth over the cosine with the viewing axis.
-    clear, _, depth = render_sample(pose, FOCAL, HEIGHT, WIDTH, supersample=1)
+    clear, _, depth = render_sample(pose, FOCAL, HEIGHT, WIDTH, still_life(), supersample=1)
     scene = still_life(haze=0.3)
     hazy, _, _ = render_sample(pose, FOCAL, HEIGHT, WIDTH, scene, supersample=1)
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5

@@ -26,7 +26,8 @@ from sparsestyle_ns.effects.exposure import build_exposure
 from sparsestyle_ns.effects.matched_depth import matched_rays
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.effects.scene import Scene
-from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig, CoarseFieldConfig
+from sparsestyle_ns.fields.coarse import CoarseFieldConfig
+from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
 from sparsestyle_ns.models.hier_style import HierStyleModelConfig
 from sparsestyle_ns.pipelines import base as pipelines
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
@@ -178,6 +179,7 @@ def test_without_lens_distortion_no_ray_is_undistorted(tmp_path: Path):
 
 def test_rays_of_a_bent_lens_are_those_that_the_photos_show(tmp_path: Path):
     import make_sample_scene
+    from sample_scene.cameras import rays_of_rows
 
     k1, width, height = 0.4, 40, 30
     options = ["--layout", "nerfstudio", "--num-views", "9", "--supersample", "1", "--distortion", str(k1)]
@@ -190,7 +192,7 @@ def test_rays_of_a_bent_lens_are_those_that_the_photos_show(tmp_path: Path):
         manager.set_effects(decide(manager.scene, EffectSettings(lens_distortion=choice)))
         cameras = manager.train_dataset.cameras
         focal = float(cameras.fx[0])
-        true, _ = make_sample_scene._band_of_rays(np.eye(3, 4), focal, height, width, rows, 1, k1)
+        true, _ = rays_of_rows(np.eye(3, 4), focal, height, width, rows, 1, k1)
         rays = cameras.generate_rays(camera_indices=0, keep_shape=True)
         local = (rays.directions @ cameras.camera_to_worlds[0, :, :3]).reshape(-1, 3).numpy()
         errors = focal * np.linalg.norm(local[:, :2] / local[:, 2:] - true[:2].T / true[2:].T, axis=-1)

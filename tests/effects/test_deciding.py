@@ -84,13 +84,13 @@ def test_shine_is_not_taken_for_exposure_nor_exposure_for_shine(made):
 
 
 def test_exposures_are_measured_as_they_were_made(made):
-    import make_sample_scene
     import numpy as np
+    from sample_scene.writers import photo_gains
 
     from sparsestyle_ns.effects.exposure import fit_gains
 
     gains, _ = fit_gains(made("llff", *SEEN, "--exposure", "0.5").matches)
-    expected = np.log(make_sample_scene.photo_gains(9, 0.5, [0, 8]))[[1, 2, 3, 4, 5, 6, 7]]
+    expected = np.log(photo_gains(9, 0.5, [0, 8]))[[1, 2, 3, 4, 5, 6, 7]]
     # Photos are cut off at white, and bytes: a tenth of a stop is 0.07.
     assert np.abs(gains - expected).max() < 0.07
     assert np.abs(gains.mean(axis=0)).max() < 1e-6

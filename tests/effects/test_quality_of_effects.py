@@ -16,11 +16,10 @@ from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.base import EffectSettings
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.training import Training
-from sparsestyle_ns.evaluation.held_out import evaluate_held_out
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.style.color import color_moments, gaussian_distance
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.style.painting import Painting
 
 SEEDS = (0, 1, 2)
 """Short trainings of one scene with different seeds differ by up to a decibel, so means over some are compared."""
@@ -171,7 +170,7 @@ def test_residual_density_lets_the_style_change_a_hazy_scene(scenes, painting):
     losses = []
     for choice in ("on", "off"):
         pipeline = trained_style(folder, "blender", painting, hazy, 60, {"residual_density": choice})
-        losses.append(evaluate_held_out(pipeline, pipeline.painting()).means["style_loss"])
+        losses.append(pipeline.held_out_report().means["style_loss"])
     assert losses[0] < 0.95 * losses[1]
 
 
@@ -179,7 +178,7 @@ def test_residual_density_lets_the_style_change_a_hazy_scene(scenes, painting):
 def test_palette_transfer_brings_held_out_views_to_the_colours_of_the_painting(scenes, painting):
     folder = scenes("llff")
     coarse = trained_coarse(folder, "llff", 150, {}).model.state_dict()
-    aim = color_moments(load_style_image(painting).flatten(1).T)
+    aim = color_moments(Painting.read(painting).pixels.flatten(1).T)
     distances = []
     for choice in ("on", "off"):
         pipeline = trained_style(folder, "llff", painting, coarse, 60, {"palette": choice})

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -12,10 +13,11 @@ from conftest import TINY, TINY_STYLE, decided, ns_train, only_run
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.exposure import ExposureCorrection
 from sparsestyle_ns.effects.registry import EFFECTS, decided_on_photos
+from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.gallery.page import RunPictures, gallery_page
 from sparsestyle_ns.pipelines import base as pipelines
-from sparsestyle_ns.runs.coarse_run import newest_checkpoint
-from sparsestyle_ns.runs.run_folder import find_config, load_run
+from sparsestyle_ns.runs.checkpoints import newest_checkpoint
+from sparsestyle_ns.runs.run_folder import find_config
 from sparsestyle_ns.viewer.effects_panel import EffectsPanel
 
 AUTO = [flag for flag in TINY if flag not in ("--pipeline.effects.empty-space", "on")]
@@ -134,8 +136,9 @@ def view():
     return View("view", picture, picture)
 
 
-def test_the_viewer_shows_the_table() -> None:
-    shown = []
-    gui = SimpleNamespace(add_markdown=lambda text, visible: shown.append(text))
-    EffectsPanel(decided("box").markdown).install(SimpleNamespace(gui=gui))
-    assert len(shown) == 1 and "| box | on |" in shown[0]
+def test_the_viewer_lists_every_effect() -> None:
+    gui = MagicMock()
+    viewer = SimpleNamespace(viser_server=SimpleNamespace(gui=gui))
+    EffectsPanel(SimpleNamespace(effects=decided("box")))._setup(viewer)
+    (shown,) = (call.args[0] for call in gui.add_markdown.call_args_list)
+    assert "**box** on: " in shown and len(shown.split("\n\n")) == len(EFFECTS)

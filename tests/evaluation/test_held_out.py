@@ -8,9 +8,10 @@ import torch
 from conftest import run_entrypoint
 
 from sparsestyle_ns.cli import main
-from sparsestyle_ns.evaluation.held_out import by_figure, evaluate_held_out, evaluate_run, saved_report
+from sparsestyle_ns.engine.loading import evaluate_run, load_run
+from sparsestyle_ns.evaluation.held_out import by_figure, saved_report
 from sparsestyle_ns.evaluation.tables import report_tables
-from sparsestyle_ns.runs.run_folder import find_config, load_run
+from sparsestyle_ns.runs.run_folder import find_config
 
 
 def test_baked_renders_are_held_against_exact_ones_when_asked_for(runs: SimpleNamespace, tmp_path: Path) -> None:
@@ -32,7 +33,7 @@ def test_a_view_that_shows_no_surface_has_no_sharpness_and_the_report_is_json(ru
         pipeline.model.field.density_head.weight.zero_()
         pipeline.model.field.density_head.bias.fill_(-20.0)
     pipeline.model.space.unbounded = False
-    report = evaluate_held_out(pipeline)
+    report = pipeline.held_out_report()
     assert "psnr" in report.means and "effective_samples" not in report.means
     json.dumps(report.means, allow_nan=False)
     assert by_figure([{"a": 1.0, "b": 2.0}, {"a": 3.0}]) == {"a": [1.0, 3.0], "b": [2.0]}

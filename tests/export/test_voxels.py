@@ -130,9 +130,9 @@ def test_where_no_empty_space_is_skipped_every_cell_counts(exported):
 @pytest.mark.parametrize("mix", [Mix(0.0), Mix(0.5, 0.3)])
 def test_a_run_whose_config_asks_for_less_of_the_style_is_exported_so(exported, mix):
     loaded, _, _ = exported
-    camera, before = loaded.cameras[1:2], loaded.model.look
-    loaded.model.look = replace(before, mix=mix)
+    camera, before = loaded.cameras[1:2], loaded.model.display.own
+    loaded.model.display.own = replace(before, mix=mix)
     voxels, exact = bake_voxels(loaded.model, 95, [camera]), exact_outputs(loaded.model, camera)["rgb"]
-    loaded.model.look = before
+    loaded.model.display.own = before
     assert psnr(page_picture(voxels, loaded.model, camera), exact) > 33
     assert psnr(exact, exact_outputs(loaded.model, camera)["rgb"]) < 30

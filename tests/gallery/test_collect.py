@@ -18,7 +18,7 @@ from sparsestyle_ns.evaluation.held_out import saved_report
 from sparsestyle_ns.gallery.collect import collect_run, depth_picture
 from sparsestyle_ns.gallery.film import FRAMES_PER_SECOND, encode_mp4, make_film
 from sparsestyle_ns.gallery.page import gallery_page, read_film
-from sparsestyle_ns.runs.coarse_run import newest_checkpoint
+from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 from sparsestyle_ns.utils.errors import InputError
 
 MP4 = b"\x00\x00\x00\x18ftypmp42 the rest of a film"

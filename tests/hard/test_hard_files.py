@@ -23,7 +23,7 @@ from sparsestyle_ns.data.view_selection import select_views
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.prepare.framing import frame_photos
 from sparsestyle_ns.prepare.poses import TransformsPoses, fits
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 
 FUZZ = settings(
@@ -280,7 +280,7 @@ def test_damaged_images_are_read_or_refused(tmp_path, image, cuts):
     path.write_bytes(damaged(IMAGES[image], cuts))
     read_or_refuse(open_photo, path)
     try:
-        picture = load_style_image(path)
+        picture = Painting.read(path).pixels
     except InputError as error:
         assert "\n" not in str(error)
         return

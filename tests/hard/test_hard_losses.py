@@ -4,16 +4,18 @@ from hard.table import hard_case
 
 from sparsestyle_ns.losses.content import content_loss
 from sparsestyle_ns.losses.geometry import near_density
-from sparsestyle_ns.losses.nnfm import StyleIndex, nearest_neighbors, nnfm_loss
+from sparsestyle_ns.losses.nnfm import nearest_neighbors, nnfm_loss
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
+from sparsestyle_ns.losses.style_index import StyleIndex
 from sparsestyle_ns.losses.stylization import StyleTargets, feature_rows, fit_side
-from sparsestyle_ns.style.vgg import VGGFeatures, load_backbone
+from sparsestyle_ns.style.backbone import Backbone
+from sparsestyle_ns.style.backbones import load_backbone
 
 CHANNELS = 32
 
 
 @pytest.fixture(scope="module")
-def backbone() -> VGGFeatures:
+def backbone() -> Backbone:
     """The network that comes with a package: it is the one that reflects pixels over borders."""
     return load_backbone("vgg16-shift-tolerant")
 
@@ -251,7 +253,7 @@ def test_constant_images_have_finite_losses(backbone, value):
         (torch.rand(3, 20, 16), torch.rand(16, 16, 3)),
     ):
         targets = StyleTargets(backbone, style, feature_side=16, style_side=16)
-        losses = targets.losses(picture, targets.features(content))
+        losses = list(targets.losses(targets.view(picture, targets.features(content))).values())
         (gradient,) = torch.autograd.grad(sum(losses), picture)
         assert all(loss.isfinite() for loss in losses) and gradient.isfinite().all()
         if content.equal(picture):
@@ -269,8 +271,8 @@ def test_the_smallest_and_the_longest_style_have_features(backbone, height, widt
     style = torch.rand(3, height, width, generator=torch.Generator().manual_seed(0))
     targets = StyleTargets(backbone, style, feature_side=16, style_side=48)
     assert min(fit_side(style[None], 48).shape[-2:]) >= 8
-    loss, _ = targets.losses(torch.rand(16, 16, 3), targets.features(torch.rand(16, 16, 3)))
-    assert loss.isfinite()
+    view = targets.view(torch.rand(16, 16, 3), targets.features(torch.rand(16, 16, 3)))
+    assert targets.losses(view)["style"].isfinite()
 
 
 @hard_case(
@@ -298,6 +300,7 @@ def test_views_of_hardly_anything_have_finite_losses(backbone, covered):
     accumulation = torch.zeros(256)
     accumulation[:covered] = 1
     targets = StyleTargets(backbone, torch.rand(3, 16, 16), feature_side=16, style_side=16)
-    losses = targets.losses(picture, targets.features(torch.rand(16, 16, 3)), accumulation.view(16, 16))
+    view = targets.view(picture, targets.features(torch.rand(16, 16, 3)), accumulation.view(16, 16))
+    losses = list(targets.losses(view).values())
     (gradient,) = torch.autograd.grad(sum(losses), picture)
     assert all(loss.isfinite() for loss in losses) and gradient.isfinite().all()

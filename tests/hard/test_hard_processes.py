@@ -13,9 +13,9 @@ from hard.table import hard_case
 from torch import nn
 from torch.amp import GradScaler
 
-from sparsestyle_ns.engine.trainer import FusedAdamConfig
-from sparsestyle_ns.runs.coarse_run import load_checkpoint, newest_checkpoint
-from sparsestyle_ns.runs.run_folder import load_run
+from sparsestyle_ns.engine.loading import load_run
+from sparsestyle_ns.engine.optimizers import FusedAdamConfig
+from sparsestyle_ns.runs.checkpoints import load_checkpoint, newest_checkpoint
 from sparsestyle_ns.utils import distributed as processes
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 

@@ -14,7 +14,8 @@ from conftest import TINY, TINY_STYLE, only_run
 from hard import trial
 from hard.table import hard_case
 
-from sparsestyle_ns.runs.coarse_run import load_checkpoint, newest_checkpoint, read_coarse_run
+from sparsestyle_ns.runs.checkpoints import load_checkpoint, newest_checkpoint
+from sparsestyle_ns.runs.coarse_run import read_coarse_run
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 

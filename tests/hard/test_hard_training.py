@@ -15,10 +15,11 @@ from torch import nn
 from torch.amp import GradScaler
 
 from sparsestyle_ns.core.occupancy import DensityGrid
-from sparsestyle_ns.engine.trainer import FusedAdamConfig, SparseStyleTrainer
+from sparsestyle_ns.engine.optimizers import FusedAdamConfig
+from sparsestyle_ns.engine.trainer import SparseStyleTrainer
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
-from sparsestyle_ns.runs.coarse_run import load_checkpoint, newest_checkpoint
+from sparsestyle_ns.runs.checkpoints import load_checkpoint, newest_checkpoint
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers, broken
 
 PIPELINES = {"coarse-fewshot": CoarseFewShotPipeline, "hier-style": HierStylePipeline}
@@ -317,5 +318,5 @@ def test_stage_2_stays_finite_when_the_density_leaps(runs, llff_scene, painting,
 @pytest.mark.parametrize("weight", ["0", "1e6"])
 def test_stage_2_stays_finite_with_a_painting_of_one_colour(runs, llff_scene, tmp_path, capsys, weight):
     Image.fromarray(np.full((16, 16, 3), 77, np.uint8)).save(tmp_path / "one.png")
-    flags = [*style_flags(runs, tmp_path / "one.png"), "--pipeline.content-weight", weight]
+    flags = [*style_flags(runs, tmp_path / "one.png"), "--pipeline.loss-weights.content", weight]
     train_a_thousand_steps(capsys, "hier-style", llff_scene, tmp_path, *flags)

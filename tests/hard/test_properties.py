@@ -21,6 +21,7 @@ from nerfstudio.data.scene_box import SceneBox
 from PIL import Image
 from torch.nn.functional import normalize
 
+import sparsestyle_ns.core
 import sparsestyle_ns.field_components
 import sparsestyle_ns.losses
 import sparsestyle_ns.rendering
@@ -40,14 +41,15 @@ from sparsestyle_ns.field_components import (
 )
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
-from sparsestyle_ns.losses import content, geometry, nnfm, reconstruction, semantic
+from sparsestyle_ns.losses import content, geometry, nnfm, reconstruction, semantic, style_index
 from sparsestyle_ns.losses import stylization as targets
-from sparsestyle_ns.rendering import baked, frozen_view, mixing
+from sparsestyle_ns.rendering import baked, frozen_view, mixing, visible_samples
 from sparsestyle_ns.rendering import render as volume
-from sparsestyle_ns.style import color, vgg
-from sparsestyle_ns.style import painting as image
+from sparsestyle_ns.style import backbones, color
+from sparsestyle_ns.style.painting import Painting
 
 PACKAGES = [
+    sparsestyle_ns.core,
     sparsestyle_ns.rendering,
     sparsestyle_ns.field_components,
     sparsestyle_ns.losses,
@@ -57,7 +59,12 @@ COVERED = set()
 ELSEWHERE = {
     "sparsestyle_ns.field_components.hash_grid_triton": "needs CUDA or Triton's interpreter: test_hash_grid.py",
     "sparsestyle_ns.rendering.baked_kernels.march_rays": "is what march_compiled calls",
-    "sparsestyle_ns.style.vgg.available_backbone": "takes no input: test_studies.py",
+    "sparsestyle_ns.core.camera_paths": "takes nerfstudio's cameras: test_camera_paths.py",
+    "sparsestyle_ns.core.schedules": "test_schedules.py and test_hard_schedules.py",
+    "sparsestyle_ns.losses.stylization.default_weights": "takes no input: test_stylization.py",
+    "sparsestyle_ns.losses.style_index.check_style": "refuses, and returns nothing: test_nnfm.py",
+    "sparsestyle_ns.style.backbone.check_tensor": "reads weight files: test_vgg.py",
+    "sparsestyle_ns.style.backbones": "reads weight files: test_vgg.py",
     "sparsestyle_ns.field_components.tiny_cuda_grid.has_tiny_cuda_nn": "asks what is installed: test_hier_style.py",
     "sparsestyle_ns.rendering.baked.march_compiled": "is what render_baked calls on a CPU",
 }
@@ -314,12 +321,14 @@ def tiny_fields(seed, bias):
 @covers(
     volume.render_coarse,
     volume.freeze_samples,
-    volume.visible_samples,
-    volume.evaluate_front_to_back,
+    visible_samples.visible_samples,
+    visible_samples.evaluate_front_to_back,
     volume.accumulation_of,
     volume.render_packed,
     volume.render_stylised,
     volume.render_mixed,
+    volume.surface_distance,
+    baked.shade_of,
     precision.autocast,
     precision.multiplies_bfloat16,
     precision.multiplies_tf32,
@@ -343,9 +352,8 @@ def test_renders_of_any_field_are_pictures(seed, scene, rays, steps, bias, numbe
     with precision.autocast(origins.device, number_format):
         edges = sampling.even_edges(len(origins), steps, origins.device)
         coarse = volume.render_coarse(field, segments, directions, edges, layout.unbounded, background)
-        frozen = volume.freeze_samples(
-            field, residual, density_grid.Occupancy(2), segments, steps, layout.unbounded, min_transmittance=1e-3
-        )
+        marching = visible_samples.Marching(density_grid.Occupancy(2), steps, layout.unbounded, 1e-3)
+        frozen = volume.freeze_samples(field, residual, segments, marching)
         stylised = volume.render_stylised(residual, frozen, background)
         also, again = volume.render_mixed(field, [residual], frozen, directions, background)
     (coarse.rgb.square().sum() + stylised.rgb.square().sum()).backward()
@@ -353,6 +361,10 @@ def test_renders_of_any_field_are_pictures(seed, scene, rays, steps, bias, numbe
     for render in (coarse, stylised, again):
         assert (render.rgb >= -1e-6).all() and (render.rgb <= 1 + 1e-5).all()
         assert (render.accumulation <= 1 + 1e-6).all() and (render.s >= 0).all() and (render.s <= 1 + 1e-5).all()
+        depth = volume.surface_distance(segments, render.s)
+        assert depth.isfinite().all() and (depth >= 0).all()
+    shaded = baked.shade_of(field, residual, layout, number_format)(2 * torch.rand(5, 3) - 1)
+    assert (shaded >= 0).all() and (shaded[:, 2:] <= 1).all()
     torch.testing.assert_close(volume.accumulation_of(frozen), again.accumulation)
     # What lies behind 1e-3 of the light is left out; bfloat16 rounds logits at the samples of one render alone.
     if number_format in ("float32", "tf32"):
@@ -385,10 +397,10 @@ def test_baked_renders_are_pictures(seed, scene, rays, steps, resolution):
         density = torch.exp(3 * logs + (4 * points).sin().sum(dim=-1, keepdim=True))
         return torch.cat([density, (points.repeat(1, 2) + 1) / 2], dim=-1)
 
-    batch = baked.Rays(segments, density_grid.Occupancy(2), steps, layout.unbounded, 1e-3)
+    marching = visible_samples.Marching(density_grid.Occupancy(2), steps, layout.unbounded, 1e-3)
     device = torch.device("cpu")
-    compiled = baked.render_baked(baked.BakedVolume(shade, resolution, device), batch, torch.ones(3))
-    plain = baked.march_in_torch(baked.BakedVolume(shade, resolution, device), batch, torch.ones(3))
+    compiled = baked.render_baked(baked.BakedVolume(shade, resolution, device), segments, marching, torch.ones(3))
+    plain = baked.march_in_torch(baked.BakedVolume(shade, resolution, device), segments, marching, torch.ones(3))
     for left, right in zip(compiled, plain, strict=True):
         assert (left.rgb >= -1e-6).all() and (left.rgb <= 1 + 1e-5).all()
         # A sample within rounding of a cell's border, or of 1e-3 of the light, may count in one of them alone.
@@ -533,13 +545,13 @@ def test_both_hash_grids_agree_and_stay_in_the_table(data, count, levels, highes
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-@covers(nnfm.nearest_neighbors, nnfm.nnfm_loss)
+@covers(nnfm.nearest_neighbors, nnfm.nnfm_loss, style_index.unit_vectors)
 @given(st.data(), st.integers(1, 40), st.integers(1, 60), st.integers(1, 8), ALL_FLOATS, st.integers(1, 70))
 def test_neighbours_are_the_most_similar(data, count, style_count, channels, dtype, chunk_size):
     largest = 4 if dtype == torch.float16 else 15
     features = data.draw(tensors((count, channels), -3, largest, signed=True, dtype=dtype)).requires_grad_()
     style = data.draw(tensors((style_count, channels), -3, largest, signed=True, dtype=dtype))
-    index = nnfm.StyleIndex(style, block_size=data.draw(COUNTS))
+    index = style_index.StyleIndex(style, block_size=data.draw(COUNTS))
     directions = normalize(style.double(), dim=-1)
     similarities = normalize(features.detach().double(), dim=-1) @ directions.T
     for found in (nnfm.nearest_neighbors(features, style, chunk_size), index.nearest(features)):
@@ -630,41 +642,34 @@ def test_transferred_colours_have_the_styles_mean(data, count, style_count, dtyp
     assert (cut >= 0).all() and (cut <= 1).all()
 
 
-@covers(image.load_style_image, image.read_bytes, image.decode_style_image)
 @given(
     arrays.arrays(
         st.sampled_from([np.uint8, np.uint16]),
         st.tuples(st.integers(8, 20), st.integers(8, 20)),
         elements=st.integers(0, 255),
-    ),
-    st.sampled_from([None, 8, 15, 64]),
+    )
 )
-def test_pictures_are_read_as_they_were_written(tmp_path_factory, pixels, max_side):
+def test_pictures_are_read_as_they_were_written(tmp_path_factory, pixels):
     path = tmp_path_factory.mktemp("pictures") / "picture.png"
     Image.fromarray(pixels).save(path)
-    largest = np.iinfo(pixels.dtype).max
-    assume(max_side is None or min(pixels.shape) * max_side >= 8 * max(pixels.shape))
-    read = image.load_style_image(path, max_side)
-    assert read.dtype == torch.float32 and read.min() >= 0 and read.max() <= 1
-    assert torch.equal(image.decode_style_image(image.read_bytes(path), path.name, max_side), read)
-    if max_side is None:
-        expected = torch.from_numpy(pixels.astype(np.float32) / largest)
-        torch.testing.assert_close(read, expected.expand(3, -1, -1))
-    else:
-        assert max(read.shape) <= max(3, max_side)
+    read = Painting.read(path)
+    assert read.pixels.dtype == torch.float32 and read.pixels.min() >= 0 and read.pixels.max() <= 1
+    assert torch.equal(Painting.received(path.name, path.read_bytes()).pixels, read.pixels)
+    expected = torch.from_numpy(pixels.astype(np.float32) / np.iinfo(pixels.dtype).max)
+    torch.testing.assert_close(read.pixels, expected.expand(3, -1, -1))
 
 
 @pytest.fixture(scope="module")
 def backbone():
-    return vgg.load_backbone("vgg16-shift-tolerant")
+    return backbones.load_backbone("vgg16-shift-tolerant")
 
 
-@covers(vgg.load_backbone, targets.fit_side, targets.feature_rows, targets.covered_rows, targets.sample_rows)
+@covers(backbones.load_backbone, targets.fit_side, targets.feature_rows, targets.covered_rows, targets.sample_rows)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(8, 24), st.floats(0, 1), SEEDS)
 def test_pictures_of_any_shape_have_features(backbone, height, width, side, contrast, seed):
     picture = contrast * torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(seed))
     picture.requires_grad_()
-    fitted = targets.fit_side(picture, side)
+    fitted = targets.fit_side(picture, side, backbone.smallest_side)
     assert max(fitted.shape[-2:]) == side and min(fitted.shape[-2:]) >= 8
     maps = backbone(fitted)
     rows = targets.feature_rows(maps)
@@ -672,7 +677,7 @@ def test_pictures_of_any_shape_have_features(backbone, height, width, side, cont
     assert 1 <= len(targets.covered_rows(maps, accumulation)) <= len(rows) == len(targets.covered_rows(maps, None))
     kept = targets.sample_rows(rows, max(1, len(rows) // 2))
     assert len(kept) == max(1, len(rows) // 2) and targets.sample_rows(rows, len(rows)) is rows
-    assert rows.shape[1] == vgg.FEATURE_CHANNELS and (rows >= 0).all() and rows.isfinite().all()
+    assert rows.shape[1] == backbone.channels and (rows >= 0).all() and rows.isfinite().all()
     (gradient,) = torch.autograd.grad(rows.square().mean(), picture)
     assert gradient.isfinite().all()
 

@@ -4,8 +4,9 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from sparsestyle_ns.losses import nnfm
-from sparsestyle_ns.losses.nnfm import StyleIndex, nearest_neighbors, nnfm_loss
+from sparsestyle_ns.losses import style_index
+from sparsestyle_ns.losses.nnfm import nearest_neighbors, nnfm_loss
+from sparsestyle_ns.losses.style_index import StyleIndex
 
 
 @pytest.fixture
@@ -264,8 +265,8 @@ def test_the_search_of_an_index_fills_no_tensor_larger_than_the_features(monkeyp
     features, style_features = random_vectors()
     style = StyleIndex(style_features, block_size=4)
     expected = style.nearest(features)
-    monkeypatch.setattr(nnfm, "TABLE_SIZE", 64)
-    monkeypatch.setitem(nnfm.BOUNDED_AT_ONCE, "cpu", 6)
+    monkeypatch.setattr(style_index, "TABLE_SIZE", 64)
+    monkeypatch.setitem(style_index.BOUNDED_AT_ONCE, "cpu", 6)
     with Operations(CHANNELS) as operations:
         found = style.nearest(features)
     assert torch.equal(found, expected)
@@ -276,9 +277,9 @@ def test_the_search_of_an_index_fills_no_tensor_larger_than_the_features(monkeyp
 def test_products_of_outlines_are_never_below_those_of_the_vectors(count):
     # Vectors all but inside the basis, and some of them equal: nothing but rounding is left to be covered.
     inside = normal(200, count) @ normal(count, 768, seed=1) + 1e-6 * normal(200, 768, seed=2)
-    directions = nnfm._directions(torch.cat([inside, inside[:50] * 3]).float())
-    basis = nnfm._principal_axes(directions)[:, :count].contiguous()
-    outlines = nnfm._outline(directions, basis)
+    directions = style_index.unit_vectors(torch.cat([inside, inside[:50] * 3]).float())
+    basis = style_index._principal_axes(directions)[:, :count].contiguous()
+    outlines = style_index._outline(directions, basis)
     exact = directions.double() @ directions.double().T
     bounds = outlines @ outlines.T
     assert (bounds >= exact).all()
@@ -288,7 +289,7 @@ def test_products_of_outlines_are_never_below_those_of_the_vectors(count):
 @pytest.mark.parametrize("block_size", [1, 2, 7, 1000])
 @pytest.mark.parametrize("count", [1, 2, 9, 100, 129])
 def test_blocks_hold_each_row_and_no_more_rows_than_asked_for(count, block_size):
-    blocks = nnfm._similar_blocks(normal(count, 3), block_size)
+    blocks = style_index._similar_blocks(normal(count, 3), block_size)
     assert blocks.shape[1] <= block_size
     assert blocks.unique().tolist() == list(range(count))
     assert (blocks.flatten().bincount()[:-1] == 1).all()
@@ -298,7 +299,9 @@ def test_blocks_hold_each_row_and_no_more_rows_than_asked_for(count, block_size)
 def test_blocks_hold_what_is_alike():
     centres = torch.tensor([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0], [9.0, 9.0]])
     points = centres.repeat(5, 1) + 0.1 * normal(20, 2).float()
-    assert sorted((blocks % 4).tolist() for blocks in nnfm._similar_blocks(points, 5)) == [[k] * 5 for k in range(4)]
+    assert sorted((blocks % 4).tolist() for blocks in style_index._similar_blocks(points, 5)) == [
+        [k] * 5 for k in range(4)
+    ]
 
 
 def test_an_index_of_no_features_is_refused():

@@ -29,7 +29,7 @@ from sparsestyle_ns.metrics.image import ALEXNET_FILE, lpips_metric
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 from sparsestyle_ns.studies import study
 from sparsestyle_ns.studies.comparison import style_table
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 
 
@@ -209,7 +209,7 @@ def test_a_row_of_a_study_has_it_for_every_fourth_frame(with_weights: None, pain
     stylised, coarse = ([torch.rand(40, 50, 3) for _ in range(5)] for _ in range(2))
     frames = PathFrames(stylised, coarse, [SimpleNamespace(covered=torch.ones(40, 50, dtype=torch.bool))] * 5)
     figures = study.Painter(painting).figures(frames, HierStylePipelineConfig(feature_side=48))
-    expected = ArtFID.against(load_style_image(painting))
+    expected = ArtFID.against(Painting.read(painting).pixels)
     for index in (0, 4):
         expected.add(stylised[index], coarse[index])
     assert figures["art_fid"] == pytest.approx(expected.figures()["art_fid"])

@@ -9,13 +9,15 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.field_components import encodings
 from torch.nn.functional import normalize
 
-from sparsestyle_ns.engine.trainer import FusedAdamConfig
+from sparsestyle_ns.engine.optimizers import FusedAdamConfig
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.field_components.point_encodings import NoEncoding
 from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid
-from sparsestyle_ns.models import hier_style
-from sparsestyle_ns.models.coarse_fewshot import CoarseFieldConfig
-from sparsestyle_ns.models.hier_style import MOST_BAKED, HierStyleModelConfig, Look
+from sparsestyle_ns.fields import fine
+from sparsestyle_ns.fields.coarse import CoarseFieldConfig
+from sparsestyle_ns.models.hier_style import HierStyleModelConfig
+from sparsestyle_ns.rendering.baked_cache import MOST_BAKED
+from sparsestyle_ns.rendering.look import Look
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.utils.errors import InputError
 
@@ -68,7 +70,7 @@ def model():
 @torch.no_grad()
 def render(model, mode=None):
     if mode is not None:
-        model.look = replace(model.look, mode=mode)
+        model.display.own = replace(model.display.own, mode=mode)
     generator = torch.Generator().manual_seed(0)
     origins = 3 * normalize(torch.randn(50, 3, generator=generator), dim=-1)
     aim = torch.rand(50, 3, generator=generator) - 0.5
@@ -84,7 +86,7 @@ def assert_close(found, expected, tolerance=0.02):
 
 
 def volume(model):
-    return model._baked[model.residual][0]
+    return model.baked.volumes[model.residual][0]
 
 
 def test_a_baked_picture_is_nearly_the_exact_one_and_exact_is_the_default(model):
@@ -95,7 +97,7 @@ def test_a_baked_picture_is_nearly_the_exact_one_and_exact_is_the_default(model)
 
 def test_exact_pictures_bake_nothing(model):
     render(model, "exact")
-    assert not model._baked
+    assert not model.baked.volumes
 
 
 def test_a_baked_model_has_the_state_of_an_exact_one(model):
@@ -152,7 +154,7 @@ def test_another_coarse_field_is_seen_in_the_next_picture(model):
 
 def test_pictures_are_exact_while_the_model_trains(model):
     found = render(model.train())
-    assert not model._baked
+    assert not model.baked.volumes
     assert_close(found, render(make_model()), tolerance=0)
 
 
@@ -202,8 +204,8 @@ def test_the_hash_grid_is_tiny_cuda_nns_on_a_gpu_where_it_is_installed_and_the_c
     assert HierStyleModelConfig().fine_encoding == "auto"
     built = []
     for name in ("TinyCudaGrid", "HashGrid"):
-        kind = getattr(hier_style, name)
-        monkeypatch.setattr(hier_style, name, lambda *shape, kind=kind, **at: built.append((kind, at)) or NoEncoding())
+        kind = getattr(fine, name)
+        monkeypatch.setattr(fine, name, lambda *shape, kind=kind, **at: built.append((kind, at)) or NoEncoding())
     model = make_untrained(device=device)
     assert model.config.fine_encoding == chosen
     expected = (TinyCudaGrid, {"device": torch.device(device)}) if chosen == "tiny-cuda-nn" else (HashGrid, {})
@@ -212,9 +214,9 @@ def test_the_hash_grid_is_tiny_cuda_nns_on_a_gpu_where_it_is_installed_and_the_c
 
 def test_a_picture_in_one_mode_leaves_the_models_own_as_it_was(model):
     with pytest.raises(RuntimeError), model.rendering("exact"):
-        assert model.look.mode == "exact"
+        assert model.display.look.mode == "exact"
         raise RuntimeError
-    assert model.look.mode == "baked"
+    assert model.display.look.mode == "baked"
 
 
 BOTH_MODES = pytest.mark.parametrize("mode", ["exact", "baked"])
@@ -222,7 +224,7 @@ PARTS = ("rgb", "accumulation", "depth")
 
 
 def shown(model, mode, *styles, **mix):
-    model.look = Look(mode, Mix(**mix), styles or None)
+    model.display.own = Look(mode, Mix(**mix), styles or None)
     return render(model)
 
 
@@ -290,7 +292,7 @@ def test_only_so_many_styles_stay_baked_the_latest_ones(model):
     styles = [model.residual, *(another_style(model) for _ in range(MOST_BAKED))]
     for style in styles:
         shown(model, "baked", style)
-    assert list(model._baked) == styles[1:]
+    assert list(model.baked.volumes) == styles[1:]
 
 
 def test_a_run_shows_the_strengths_in_its_config_and_training_shows_none(model):

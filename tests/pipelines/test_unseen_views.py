@@ -10,7 +10,7 @@ from torch.nn.functional import interpolate
 
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.pipelines.datamanager import bundle_rays
-from sparsestyle_ns.runs.coarse_run import load_checkpoint, newest_checkpoint
+from sparsestyle_ns.runs.checkpoints import load_checkpoint, newest_checkpoint
 from sparsestyle_ns.utils.errors import InputError
 
 ON = {"semantic_weight": 0.5, "semantic_every": 4, "semantic_side": 16}

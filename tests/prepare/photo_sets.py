@@ -5,9 +5,12 @@ from functools import cache
 from pathlib import Path
 from typing import List, Sequence, Tuple
 
-import make_sample_scene
 import numpy as np
 from PIL import ExifTags, Image
+from sample_scene.cameras import look_at
+from sample_scene.scene import still_life
+from sample_scene.tracer import render_sample
+from sample_scene.writers import poses_bounds_row, to_bytes
 
 WIDTH, HEIGHT = 320, 240
 FOCAL = 0.85 * WIDTH
@@ -24,9 +27,9 @@ AWAY: Place = ((0.0, 0.0, 1.3), (9.0, 1.0, 0.8))
 @cache
 def photo(place: Place) -> Image.Image:
     """What a camera sees there."""
-    scene, pose = make_sample_scene.still_life(0), make_sample_scene.look_at(*place)
-    rgb, _, _ = make_sample_scene.render_sample(pose, FOCAL, HEIGHT, WIDTH, scene, 1)
-    return Image.fromarray(make_sample_scene._to_bytes(rgb))
+    scene, pose = still_life(0), look_at(*place)
+    rgb, _, _ = render_sample(pose, FOCAL, HEIGHT, WIDTH, scene, 1)
+    return Image.fromarray(to_bytes(rgb))
 
 
 def write_photos(folder: Path, places: Sequence[Place] = tuple(ASIDE), suffix: str = ".png") -> List[str]:
@@ -47,15 +50,15 @@ def save_with_orientation(image: Image.Image, path: Path, orientation: int) -> N
 
 def write_poses_bounds(folder: Path, places: Sequence[Place] = tuple(ASIDE)) -> None:
     """The places as LLFF has them."""
-    poses = [make_sample_scene.look_at(*place) for place in places]
-    rows = [make_sample_scene.poses_bounds_row(pose, HEIGHT, WIDTH, FOCAL, 2.0, 6.0) for pose in poses]
+    poses = [look_at(*place) for place in places]
+    rows = [poses_bounds_row(pose, HEIGHT, WIDTH, FOCAL, 2.0, 6.0) for pose in poses]
     np.save(folder / "poses_bounds.npy", np.stack(rows))
 
 
 def write_transforms(folder: Path, names: Sequence[str], places: Sequence[Place] = tuple(ASIDE), **shared) -> None:
     """The places as nerfstudio has them."""
     frames = [
-        {"file_path": f"images/{name}", "transform_matrix": make_sample_scene.look_at(*place).tolist()}
+        {"file_path": f"images/{name}", "transform_matrix": look_at(*place).tolist()}
         for name, place in zip(names, places, strict=True)
     ]
     intrinsics = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 150.0, "cy": 130.0, "w": WIDTH, "h": HEIGHT}

@@ -9,6 +9,7 @@ from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
 from sparsestyle_ns.rendering.render import freeze_samples, render_stylised
+from sparsestyle_ns.rendering.visible_samples import Marching
 
 RAYS, STEPS = 20, 10
 SPACE = BoxSpace(SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])))
@@ -34,7 +35,7 @@ class Scene:
     def freeze(self, run):
         self.frozen_runs.append(run)
         segments = SPACE.segments(*(part[run] for part in self.rays))
-        return freeze_samples(self.coarse, self.residual, self.occupancy, segments, STEPS, False, 0.0)
+        return freeze_samples(self.coarse, self.residual, segments, Marching(self.occupancy, STEPS, False, 0.0))
 
     def render_chunk(self, frozen):
         self.rendered_chunks += 1

@@ -23,6 +23,7 @@ from sparsestyle_ns.rendering.render import (
     render_mixed,
     render_stylised,
 )
+from sparsestyle_ns.rendering.visible_samples import Marching
 
 RAYS, STEPS, FEATURES = 14, 12, 4
 WHITE = torch.ones(3)
@@ -75,7 +76,8 @@ def rays():
 def freeze(coarse, residual, rays, space="box", occupancy=None, min_transmittance=0.0):
     occupancy = Occupancy(4) if occupancy is None else occupancy
     space = SPACES[space]
-    return freeze_samples(coarse, residual, occupancy, space.segments(*rays), STEPS, space.unbounded, min_transmittance)
+    marching = Marching(occupancy, STEPS, space.unbounded, min_transmittance)
+    return freeze_samples(coarse, residual, space.segments(*rays), marching)
 
 
 def slow_render(space, rays, shade, background):

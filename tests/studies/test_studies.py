@@ -114,7 +114,7 @@ def test_every_flag_of_every_kind_is_one_that_ns_train_knows(llff_scene: Path, p
     assert [kind for kind, config in settings.items() if config.effects.residual_density == "off"] == ["coarse-density"]
     assert all(parsed[each.name].logging.steps_per_log == 1 for each in runs)
     assert {parsed[each.name].pipeline.backbone for each in runs} == {Study(scene).backbone} == {"vgg16-shift-tolerant"}
-    assert [settings[f"lambda-{w}"].content_weight for w in ("10", "1", "0.1")] == [10.0, 1.0, 0.1]
+    assert [settings[f"lambda-{w}"].loss_weights["content"] for w in ("10", "1", "0.1")] == [10.0, 1.0, 0.1]
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image, ImageOps
 
-from sparsestyle_ns.style.painting import load_style_image
+from sparsestyle_ns.style.painting import THUMBNAIL_SIDE, Painting
 from sparsestyle_ns.utils.errors import InputError
 
 HEIGHT, WIDTH = 12, 20
@@ -50,7 +50,7 @@ def deep_png(path, samples, color_type, chunks=()):
 
 
 def test_a_png_comes_back_exactly_as_float32_rgb_in_the_unit_range(tmp_path, pixels):
-    image = load_style_image(saved(tmp_path / "style.png", Image.fromarray(pixels)))
+    image = Painting.read(saved(tmp_path / "style.png", Image.fromarray(pixels))).pixels
     assert image.shape == (3, HEIGHT, WIDTH)
     assert image.dtype == torch.float32
     assert image.device.type == "cpu"
@@ -61,53 +61,55 @@ def test_a_png_comes_back_exactly_as_float32_rgb_in_the_unit_range(tmp_path, pix
 def test_a_path_may_be_a_string_and_start_at_the_home_folder(tmp_path, pixels, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     saved(tmp_path / "style.png", Image.fromarray(pixels))
-    assert torch.equal(load_style_image("~/style.png"), as_tensor(pixels))
+    assert torch.equal(Painting.read("~/style.png").pixels, as_tensor(pixels))
 
 
 @pytest.mark.parametrize(("name", "options"), [("a.jpg", {"quality": 95}), ("a.webp", {"quality": 95})])
 def test_lossy_formats_are_read(name, options, tmp_path, smooth):
-    image = load_style_image(saved(tmp_path / name, Image.fromarray(smooth), **options))
+    image = Painting.read(saved(tmp_path / name, Image.fromarray(smooth), **options)).pixels
     assert (image - as_tensor(smooth)).abs().max() < 0.04
 
 
 @pytest.mark.parametrize("name", ["a.webp", "a.tiff", "a.bmp"])
 def test_lossless_formats_are_read_exactly(name, tmp_path, pixels):
     options = {"lossless": True} if name == "a.webp" else {}
-    assert torch.equal(load_style_image(saved(tmp_path / name, Image.fromarray(pixels), **options)), as_tensor(pixels))
+    assert torch.equal(
+        Painting.read(saved(tmp_path / name, Image.fromarray(pixels), **options)).pixels, as_tensor(pixels)
+    )
 
 
 def test_the_name_of_a_file_does_not_decide_its_format(tmp_path, pixels):
     path = saved(tmp_path / "style.jpg", Image.fromarray(pixels), format="PNG")
-    assert torch.equal(load_style_image(path), as_tensor(pixels))
+    assert torch.equal(Painting.read(path).pixels, as_tensor(pixels))
 
 
 def test_a_cmyk_jpeg_is_read_as_rgb(tmp_path, smooth):
     path = saved(tmp_path / "print.jpg", Image.fromarray(smooth).convert("CMYK"), quality=95)
     assert Image.open(path).mode == "CMYK"
-    assert (load_style_image(path) - as_tensor(smooth)).abs().max() < 0.04
+    assert (Painting.read(path).pixels - as_tensor(smooth)).abs().max() < 0.04
 
 
 def test_grey_becomes_three_equal_channels(tmp_path, pixels):
     grey = pixels[..., 0]
-    image = load_style_image(saved(tmp_path / "grey.png", Image.fromarray(grey)))
+    image = Painting.read(saved(tmp_path / "grey.png", Image.fromarray(grey))).pixels
     assert torch.equal(image, as_tensor(np.stack([grey] * 3, axis=2)))
 
 
 def test_black_and_white_pixels_of_one_bit_are_read(tmp_path, pixels):
     bits = pixels[..., 0] > 127
-    image = load_style_image(saved(tmp_path / "bits.png", Image.fromarray(bits)))
+    image = Painting.read(saved(tmp_path / "bits.png", Image.fromarray(bits))).pixels
     assert torch.equal(image, as_tensor(np.stack([bits] * 3, axis=2), white=1))
 
 
 def test_transparent_pixels_are_laid_over_white(tmp_path, pixels):
     alpha = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 1), dtype=np.uint8)
     opacity = alpha / 255
-    image = load_style_image(saved(tmp_path / "rgba.png", Image.fromarray(np.concatenate([pixels, alpha], axis=2))))
+    image = Painting.read(saved(tmp_path / "rgba.png", Image.fromarray(np.concatenate([pixels, alpha], axis=2)))).pixels
     torch.testing.assert_close(image, as_tensor(pixels * opacity + 255 * (1 - opacity)))
 
     grey_alpha = Image.fromarray(np.concatenate([pixels[..., :1], alpha], axis=2))
     assert grey_alpha.mode == "LA"
-    image = load_style_image(saved(tmp_path / "la.png", grey_alpha))
+    image = Painting.read(saved(tmp_path / "la.png", grey_alpha)).pixels
     grey = pixels[..., :1].repeat(3, axis=2)
     torch.testing.assert_close(image, as_tensor(grey * opacity + 255 * (1 - opacity)))
 
@@ -122,21 +124,21 @@ def palette_image():
 
 def test_a_palette_is_looked_up(tmp_path):
     image, colors, indices = palette_image()
-    assert torch.equal(load_style_image(saved(tmp_path / "p.png", image)), as_tensor(colors[indices]))
+    assert torch.equal(Painting.read(saved(tmp_path / "p.png", image)).pixels, as_tensor(colors[indices]))
 
 
 def test_transparent_palette_entries_are_white(tmp_path):
     image, colors, indices = palette_image()
     path = saved(tmp_path / "p.png", image, transparency=1)
     colors[1] = 255
-    assert torch.equal(load_style_image(path), as_tensor(colors[indices]))
+    assert torch.equal(Painting.read(path).pixels, as_tensor(colors[indices]))
 
 
 def test_half_transparent_palette_entries_are_mixed_with_white(tmp_path):
     image, colors, indices = palette_image()
     path = saved(tmp_path / "p.png", image, transparency=bytes([255, 51, 255]))
     colors[1] = [204, 244, 204]
-    torch.testing.assert_close(load_style_image(path), as_tensor(colors[indices]))
+    torch.testing.assert_close(Painting.read(path).pixels, as_tensor(colors[indices]))
 
 
 def deep_samples(channels):
@@ -146,7 +148,7 @@ def deep_samples(channels):
 def test_rgb_of_16_bits_keeps_every_bit(tmp_path):
     samples = deep_samples(3)
     cv2.imwrite(str(tmp_path / "deep.png"), samples[..., ::-1])
-    assert torch.equal(load_style_image(tmp_path / "deep.png"), as_tensor(samples, white=65535))
+    assert torch.equal(Painting.read(tmp_path / "deep.png").pixels, as_tensor(samples, white=65535))
 
 
 def test_grey_of_16_bits_keeps_every_bit(tmp_path):
@@ -154,7 +156,7 @@ def test_grey_of_16_bits_keeps_every_bit(tmp_path):
     expected = as_tensor(samples.repeat(3, axis=2), white=65535)
     for name in ("deep.png", "deep.tiff"):
         cv2.imwrite(str(tmp_path / name), samples)
-        assert torch.equal(load_style_image(tmp_path / name), expected)
+        assert torch.equal(Painting.read(tmp_path / name).pixels, expected)
 
 
 @pytest.mark.parametrize(("color_type", "channels"), [(4, 2), (6, 4)])
@@ -162,7 +164,7 @@ def test_transparency_of_16_bits_is_laid_over_white(color_type, channels, tmp_pa
     samples = deep_samples(channels)
     opacity = samples[..., -1:] / 65535
     color = np.broadcast_to(samples[..., :-1], (HEIGHT, WIDTH, 3))
-    image = load_style_image(deep_png(tmp_path / "deep.png", samples, color_type))
+    image = Painting.read(deep_png(tmp_path / "deep.png", samples, color_type)).pixels
     torch.testing.assert_close(image, as_tensor(color * opacity + 65535 * (1 - opacity), white=65535))
 
 
@@ -172,7 +174,7 @@ def test_a_photograph_is_turned_upright_as_exif_says(orientation, tmp_path, pixe
     exif[0x0112] = orientation
     path = saved(tmp_path / "turned.png", Image.fromarray(pixels), exif=exif)
     upright = ImageOps.exif_transpose(Image.open(path))
-    assert torch.equal(load_style_image(path), as_tensor(upright))
+    assert torch.equal(Painting.read(path).pixels, as_tensor(upright))
     assert upright.size == ((WIDTH, HEIGHT) if orientation < 5 else (HEIGHT, WIDTH))
 
 
@@ -188,44 +190,19 @@ def test_a_picture_of_16_bits_is_turned_upright_too(orientation, tmp_path):
     path = deep_png(tmp_path / "deep.png", samples, 2, chunks=[exif_chunk(orientation)])
     # Pillow keeps the upper 8 of the 16 bits, which is enough to tell how the picture lies.
     upright = ImageOps.exif_transpose(Image.open(path))
-    assert (load_style_image(path) - as_tensor(upright)).abs().max() < 1.5 / 255
+    assert (Painting.read(path).pixels - as_tensor(upright)).abs().max() < 1.5 / 255
 
 
 def test_a_jpeg_is_turned_upright(tmp_path, smooth):
     exif = Image.Exif()
     exif[0x0112] = 6
     path = saved(tmp_path / "turned.jpg", Image.fromarray(smooth), quality=95, exif=exif)
-    assert (load_style_image(path) - as_tensor(np.rot90(smooth, -1))).abs().max() < 0.04
+    assert (Painting.read(path).pixels - as_tensor(np.rot90(smooth, -1))).abs().max() < 0.04
 
 
-def test_reducing_averages_over_areas(tmp_path, pixels):
-    path = saved(tmp_path / "style.png", Image.fromarray(pixels.repeat(2, axis=0).repeat(2, axis=1)))
-    torch.testing.assert_close(load_style_image(path, max_side=WIDTH), as_tensor(pixels))
-
-
-def test_a_fine_pattern_becomes_its_mean_and_no_other_pattern(tmp_path):
-    checkerboard = np.indices((100, 200)).sum(axis=0) % 2 * 255
-    path = saved(tmp_path / "fine.png", Image.fromarray(checkerboard.astype(np.uint8)))
-    image = load_style_image(path, max_side=37)
-    assert image.shape == (3, 18, 37)
-    # A pixel covers 5.4² of the squares, so that its mean is off by at most one row of them.
-    assert (image - 0.5).abs().max() < 0.05
-
-
-@pytest.mark.parametrize("max_side", [None, WIDTH, WIDTH + 1, 4000])
-def test_an_image_is_never_enlarged(max_side, tmp_path, pixels):
-    path = saved(tmp_path / "style.png", Image.fromarray(pixels))
-    assert torch.equal(load_style_image(path, max_side=max_side), as_tensor(pixels))
-
-
-def test_the_longer_side_is_the_one_that_is_limited(tmp_path, pixels):
-    path = saved(tmp_path / "tall.png", Image.fromarray(np.ascontiguousarray(pixels.transpose(1, 0, 2))))
-    assert load_style_image(path, max_side=15).shape == (3, 15, 9)
-
-
-def message_of(path, **options):
+def message_of(path):
     with pytest.raises(InputError) as caught:
-        load_style_image(path, **options)
+        Painting.read(path)
     message = str(caught.value)
     assert str(path) in message
     assert "\n" not in message
@@ -297,7 +274,7 @@ def test_damaged_bytes_give_an_image_or_an_error_for_the_user(tmp_path):
             damaged[random.integers(8, len(data))] = random.integers(0, 256)
             path.write_bytes(damaged)
             try:
-                assert load_style_image(path).shape[0] == 3
+                assert Painting.read(path).pixels.shape[0] == 3
             except InputError:
                 refused += 1
     assert refused > 100
@@ -310,10 +287,15 @@ def test_an_image_of_fewer_than_8_pixels_a_side_is_refused(size, tmp_path):
 
 
 def test_8_pixels_a_side_are_enough(tmp_path):
-    assert load_style_image(saved(tmp_path / "small.png", Image.new("RGB", (8, 8)))).shape == (3, 8, 8)
+    assert Painting.read(saved(tmp_path / "small.png", Image.new("RGB", (8, 8)))).pixels.shape == (3, 8, 8)
 
 
-def test_a_limit_that_leaves_fewer_than_8_pixels_a_side_is_refused(tmp_path):
-    path = saved(tmp_path / "strip.png", Image.new("RGB", (400, 20)))
-    message = message_of(path, max_side=100)
-    assert "400 × 20 pixels, would be reduced to 100 × 5: allow a longer side than 100, or crop it" in message
+def test_a_painting_keeps_its_file_and_its_name_and_makes_a_small_jpeg(tmp_path, pixels):
+    path = saved(tmp_path / "style.png", Image.fromarray(np.tile(pixels, (20, 20, 1))))
+    read, received = Painting.read(path), Painting.received("C:\\pictures\\style.png", path.read_bytes())
+    assert read.name == received.name == "style.png"
+    assert read.data == received.data == path.read_bytes()
+    assert torch.equal(read.pixels, received.pixels)
+    with Image.open(io.BytesIO(read.thumbnail())) as small:
+        assert small.format == "JPEG" and max(small.size) == THUMBNAIL_SIDE
+    assert Painting.received("", path.read_bytes()).name == "upload"

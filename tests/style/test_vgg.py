@@ -14,7 +14,7 @@ import torch
 from sparsestyle_ns.losses.content import content_loss
 from sparsestyle_ns.losses.nnfm import nnfm_loss
 from sparsestyle_ns.style import vgg
-from sparsestyle_ns.style.vgg import load_backbone
+from sparsestyle_ns.style.backbones import load_backbone
 from sparsestyle_ns.utils.errors import InputError
 
 IMAGENET_MEAN = torch.tensor([0.485, 0.456, 0.406]).view(3, 1, 1)
@@ -116,7 +116,7 @@ def test_the_plain_network_is_torchvisions(plain_file, images):
     state = {key.removeprefix("features."): value for key, value in torch.load(plain_file).items()}
     peer[:16].load_state_dict(state)
     features = load_backbone("vgg16", plain_file).double()(images.double())
-    assert features.shape == (2, vgg.FEATURE_CHANNELS, 9, 12)
+    assert features.shape == (2, vgg.VGG16.channels, 9, 12)
     torch.testing.assert_close(features, block_3(peer.double(), 16, images.double()), rtol=0, atol=1e-10)
 
 
@@ -130,7 +130,7 @@ def test_the_shift_tolerant_network_is_that_of_its_own_package(images):
     backbone = load_backbone("vgg16-shift-tolerant")
     assert str(path) in backbone.description.source
     features = backbone.double()(images.double())
-    assert features.shape == (2, vgg.FEATURE_CHANNELS, 10, 14)
+    assert features.shape == (2, vgg.VGG16.channels, 10, 14)
     torch.testing.assert_close(features, block_3(peer.double(), 18, images.double()), rtol=0, atol=1e-10)
 
 
@@ -267,8 +267,9 @@ def test_the_shift_tolerant_network_is_taken_on_request_without_asking_the_netwo
 def test_no_code_of_the_package_is_run():
     pytest.importorskip("stlpips_pytorch")
     program = (
-        "import sys; from sparsestyle_ns.style.vgg import load_backbone; assert 'torchvision' not in sys.modules; "
-        "load_backbone('vgg16-shift-tolerant'); sys.exit('stlpips_pytorch' in sys.modules)"
+        "import sys; from sparsestyle_ns.style.backbones import load_backbone; "
+        "assert 'torchvision' not in sys.modules; load_backbone('vgg16-shift-tolerant'); "
+        "sys.exit('stlpips_pytorch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 

@@ -20,9 +20,9 @@ torch.set_num_threads(2)
 _, pipeline, _ = load_run(run / "config.yml")
 Viewer(ViewerConfig(websocket_host="127.0.0.1"), run / "viewer.txt", run, pipeline, train_lock=threading.Lock())
 panel = pipeline.panel
-panel.iterations.value, panel.path.value = 100000, painting
-panel.start.cb_hook(panel.start)
-while "Iteration 2" not in panel.message.content:
+panel.restyling.iterations.value, panel.restyling.path.value = 100000, painting
+panel.restyling.restyle_path()
+while "Iteration 2" not in panel.restyling.message.content:
     time.sleep(0.01)
 print("closing")
 raise KeyboardInterrupt  # as in ns-viewer's main thread on Ctrl-C

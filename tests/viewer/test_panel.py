@@ -25,16 +25,20 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer import Viewer
 from PIL import Image
 
+from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
 from sparsestyle_ns.engine.training import Training
+from sparsestyle_ns.engine.training_step import warm_start
 from sparsestyle_ns.export.command import load_scene
 from sparsestyle_ns.gallery.collect import collect_run
-from sparsestyle_ns.models.hier_style import MOST_BAKED
-from sparsestyle_ns.pipelines.hier_style import StepLosses
-from sparsestyle_ns.runs.run_folder import find_config, load_run
+from sparsestyle_ns.losses.stylization import Losses
+from sparsestyle_ns.rendering.baked_cache import MOST_BAKED
+from sparsestyle_ns.runs.run_folder import find_config
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.viewer.baking import STEPS_BETWEEN
 from sparsestyle_ns.viewer.panel import NO_BLEND, StylePanel
-from sparsestyle_ns.viewer.styles import Style, StyleImage, plain
+from sparsestyle_ns.viewer.styles import Style
+from sparsestyle_ns.viewer.texts import plain
 
 
 class Drawing(RenderStateMachine):
@@ -90,10 +94,10 @@ def at_rest(request: pytest.FixtureRequest) -> Iterator[None]:
 def wait_for(panel: StylePanel) -> str:
     """What the panel says when it has done what it does."""
     end = time.monotonic() + 60
-    while panel._busy.locked():
-        assert time.monotonic() < end, panel.message.content
+    while panel.restyling.is_busy:
+        assert time.monotonic() < end, panel.restyling.message.content
         time.sleep(0.05)
-    return shown_text(panel.message.content)
+    return shown_text(panel.restyling.message.content)
 
 
 def shown_text(markdown: str) -> str:
@@ -121,16 +125,16 @@ def test_sliders_change_the_viewers_picture_and_no_other(panel: StylePanel) -> N
 
 
 def test_without_a_gpu_the_viewer_begins_with_baked_pictures(panel: StylePanel) -> None:
-    assert panel.mode.value == "baked" and panel.mode.options == ["exact", "baked"]
+    assert panel.mode.value == "baked" and panel.mode.options == ("exact", "baked")
     drawn(panel)
-    assert panel.pipeline.model.residual in panel.pipeline.model._baked
+    assert panel.pipeline.model.residual in panel.pipeline.model.baked.volumes
 
 
 def test_several_threads_may_fill_one_volume_at_a_time(panel: StylePanel) -> None:
     model = panel.pipeline.model
     cameras = panel.pipeline.datamanager.train_dataset.cameras
     alone = [drawn(panel)]
-    model._baked.clear()
+    model.baked.volumes.clear()
     threads = [
         Drawing(lambda camera=camera: model.get_outputs_for_camera(camera)["rgb"])
         for camera in (cameras[:1], cameras[1:2], cameras[2:3]) * 2
@@ -170,7 +174,7 @@ def test_a_style_whose_volume_was_thrown_away_is_filled_ahead_again(
     small = deepcopy(panel.baker.cameras[0])
     small.rescale_output_resolution(0.1)
     monkeypatch.setattr(panel.baker, "cameras", [small])
-    model._baked.clear()
+    model.baked.volumes.clear()
 
     def look_at(style: Style) -> None:
         panel.style.value = style.name
@@ -184,7 +188,7 @@ def test_a_style_whose_volume_was_thrown_away_is_filled_ahead_again(
 
     for style in [*styles, styles[0]]:
         look_at(style)
-    assert len(panel.baker.filled) == len(model._baked) == MOST_BAKED
+    assert len(panel.baker.filled) == len(model.baked.volumes) == MOST_BAKED
     panel.style.value = styles[-1].name
     assert panel.baker.is_done()  # one of the latest
     forgotten = weakref.ref(styles.pop(1).field)
@@ -204,7 +208,7 @@ def test_the_split_shows_coarse_and_stylised_and_stays_for_the_next_browser(pane
     control_panel = panel.viewer.control_panel
     assert control_panel.output_render == "rgb" and not control_panel.split
     panel.split.value = True
-    panel._apply_split()
+    panel.apply_split()
     control_panel.update_output_options(list(control_panel._output_render.options))  # as for each new browser
     assert (control_panel.output_render, control_panel.split_output_render) == ("rgb_coarse", "rgb")
     assert control_panel.split
@@ -220,7 +224,7 @@ def test_the_split_shows_coarse_and_stylised_and_stays_for_the_next_browser(pane
 )
 def test_a_bad_upload_is_refused_in_a_sentence(panel: StylePanel, data: bytes, complaint: str) -> None:
     before = drawn(panel)
-    panel.upload.received("../upload.png", data)
+    panel.restyling.restyle_upload("../upload.png", data)
     said = wait_for(panel)
     assert said.startswith(f"**Not restyled.** {complaint}") and "\n" not in said
     assert torch.equal(drawn(panel), before) and len(panel.styles) == 1
@@ -237,8 +241,8 @@ def test_a_bad_upload_is_refused_in_a_sentence(panel: StylePanel, data: bytes, c
     ],
 )
 def test_a_bad_path_is_refused_in_a_sentence(panel: StylePanel, path: str, complaint: str) -> None:
-    panel.path.value = path
-    panel.start.cb_hook(panel.start)
+    panel.restyling.path.value = path
+    panel.restyling.restyle_path()
     assert complaint in wait_for(panel) and len(panel.styles) == 1
 
 
@@ -249,21 +253,21 @@ def test_an_error_in_the_middle_leaves_the_style_on_the_screen(
         raise RuntimeError("out of memory")
 
     monkeypatch.setattr(panel.pipeline, "step", fail)
-    panel.upload.received("a.png", png(1))
+    panel.restyling.restyle_upload("a.png", png(1))
     assert "RuntimeError: out of memory" in wait_for(panel)
     assert len(panel.styles) == 1 and drawn(panel).isfinite().all()
-    assert not panel.stop.gui_handle.visible and not panel.bar.gui_handle.visible
+    assert not panel.restyling.stop_button.visible and not panel.restyling.bar.visible
 
 
 def test_a_restyling_can_be_stopped_and_only_one_runs_at_a_time(
     panel: StylePanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on = threading.Event()
-    monkeypatch.setattr(panel, "_let_pictures_pass", lambda: go_on.wait(30))
-    panel.upload.received("a.png", png(1))
-    panel.upload.received("b.png", png(2))
-    assert panel.message.content == "One restyling at a time: wait for it, or stop it."
-    panel.stop.cb_hook(panel.stop)
+    monkeypatch.setattr(panel.restyling, "wait_for_rest", lambda: go_on.wait(30))
+    panel.restyling.restyle_upload("a.png", png(1))
+    panel.restyling.restyle_upload("b.png", png(2))
+    assert panel.restyling.message.content == "One restyling at a time: wait for it, or stop it."
+    panel.restyling.stop()
     go_on.set()
     assert wait_for(panel) == "Stopped; the style on the screen stays."
     assert len(panel.styles) == 1
@@ -271,29 +275,29 @@ def test_a_restyling_can_be_stopped_and_only_one_runs_at_a_time(
 
 def test_closing_ends_what_is_at_work(patterned_run: Path) -> None:
     with viewer_of(patterned_run) as panel:
-        panel.iterations.value = 100_000
-        panel.upload.received("a.png", png(1))
-        threads = [panel.baker, panel._restyler]
+        panel.restyling.iterations.value = 100_000
+        panel.restyling.restyle_upload("a.png", png(1))
+        threads = [panel.baker, panel.restyling.thread]
         assert all(thread.is_alive() for thread in threads)
         panel.close()
         assert not any(thread.is_alive() for thread in threads)
-        assert panel.message.content == "Stopped; the style on the screen stays."
+        assert panel.restyling.message.content == "Stopped; the style on the screen stays."
 
 
 def test_training_and_restyling_are_told_apart_and_their_last_step_always(
     panel: StylePanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sparsestyle_ns.viewer.panel.SECONDS_BETWEEN_TEXTS", 1e9)
-    trainer = SimpleNamespace(_total=9, notes=dict, training_state="completed")
+    monkeypatch.setattr("sparsestyle_ns.viewer.restyling_controls.SECONDS_BETWEEN_TEXTS", 1e9)
+    trainer = SimpleNamespace(config=SimpleNamespace(max_num_iterations=9), notes=dict, training_state="completed")
     monkeypatch.setattr(panel.viewer, "trainer", trainer)
-    monkeypatch.setattr(panel, "_described", True)
+    monkeypatch.setattr(panel, "_knows_training", True)
     told: List[str] = []
     for step in (0, 1, 8):
         content, style = torch.tensor([2.0, 3.0])
-        panel._tell(Progress("Iteration", step / 8, 1.0, (4.0, 5.0, 6.0)))
-        panel.show_losses(StepLosses(step, 1.0, content, style))
-        told += [panel.training.content.split(":")[0], f"{panel.bar.gui_handle.value:.0f}"]
-    panel._end("")
+        panel.restyling.tell(Progress("Iteration", step / 8, 1.0, {"content": 4.0}))
+        panel.show_losses(step, Losses({"content": content, "style": style}, {"content": 1.0, "style": 1.0}))
+        told += [panel.training.content.split(":")[0], f"{panel.restyling.bar.value:.0f}"]
+    panel.restyling.end("")
     assert told == ["Iteration 1 of 9", "0", "Iteration 1 of 9", "0", "Iteration 9 of 9", "100"]
 
 
@@ -301,18 +305,20 @@ def test_restyling_gives_a_style_that_blends_and_a_run_that_renders(
     panel: StylePanel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: List[str] = []
-    tell = panel._tell
-    monkeypatch.setattr(panel, "_tell", lambda progress: [tell(progress), seen.append(drawn(panel).sum().item())])
+    tell = panel.restyling.tell
+    monkeypatch.setattr(
+        panel.restyling, "tell", lambda progress: [tell(progress), seen.append(drawn(panel).sum().item())]
+    )
     first = drawn(panel)
-    panel.upload.received("other painting.png", png(3))
+    panel.restyling.restyle_upload("other painting.png", png(3))
     said = wait_for(panel)
     assert said.startswith("**other painting** is ready. Saved as a run of its own: ")
     assert len(set(seen)) == 1  # the old style stays on the screen until the new one is ready
-    assert panel.style.value == "other painting" and panel.other.options == [NO_BLEND, "painting", "other painting"]
+    assert panel.style.value == "other painting" and panel.other.options == (NO_BLEND, "painting", "other painting")
     assert "other painting.png" in panel.description.content
     second = drawn(panel)
     assert (first - second).abs().max() > 0.1
-    assert not panel.blend.gui_handle.visible
+    assert not panel.blend.visible
     panel.other.value, panel.blend.value = "painting", 1.0
     assert torch.equal(drawn(panel), first)
     panel.blend.value = 0.5
@@ -341,7 +347,7 @@ def own_style_alone(panel: StylePanel) -> Iterator[None]:
     count = len(panel.styles)
     yield
     del panel.styles[count:]
-    panel._offer_styles(panel.styles[0].name)
+    panel.offer_styles(panel.styles[0].name)
 
 
 @pytest.mark.parametrize(
@@ -361,7 +367,7 @@ def test_a_style_that_cant_be_saved_is_there_and_says_so_and_leaves_no_folder(
     folders = set(panel.folder.parent.iterdir())
     count = len(panel.styles)
     monkeypatch.setattr(broken, fail)
-    panel.upload.received("unsaved.png", png(3))
+    panel.restyling.restyle_upload("unsaved.png", png(3))
     reason = " ".join(str(error).split())
     assert wait_for(panel) == f"**unsaved** is ready. It is **not saved** ({reason}), and gone when the viewer ends."
     assert set(panel.folder.parent.iterdir()) == folders
@@ -379,7 +385,7 @@ def test_two_restylings_of_a_second_are_two_runs(panel: StylePanel, monkeypatch:
             return next(cls.times)
 
     monkeypatch.setattr("sparsestyle_ns.engine.restyling.datetime", StandingClock)
-    restyling = Restyling(panel._workshop, StyleImage.received("a.png", png(1)), iterations=1)
+    restyling = Restyling(panel.restyling.workshop, Painting.received("a.png", png(1)), iterations=1)
     for _ in restyling:
         pass
     saved = [restyling.save(), restyling.save()]
@@ -395,14 +401,14 @@ def test_a_painting_called_nothing_is_blended_in_only_when_it_is_chosen(
     panel: StylePanel, own_style_alone: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Restyling, "save", lambda _: panel.folder)
-    panel.upload.received(f"{NO_BLEND}.png", png(3))
+    panel.restyling.restyle_upload(f"{NO_BLEND}.png", png(3))
     assert wait_for(panel).startswith(f"**{NO_BLEND} 2** is ready.")
     panel.style.value = panel.styles[0].name
-    assert panel._shown() == (panel.pipeline.model.residual,)
+    assert panel.shown() == (panel.pipeline.model.residual,)
     # The run's own painting may be called that, too.
     monkeypatch.setattr(panel, "styles", [])
     monkeypatch.setattr(panel.pipeline.config, "style_image", Path(f"{NO_BLEND}.png"))
-    panel._describe_run()
+    panel._name_own_style()
     assert [style.name for style in panel.styles] == [f"{NO_BLEND} 2"]
 
 
@@ -442,7 +448,7 @@ def test_restyling_takes_the_trainers_steps(runs: SimpleNamespace, painting: Pat
     pipeline = training.pipeline
     fresh = pipeline.model.new_style()
     pipeline.model.residual.load_state_dict(fresh.state_dict())
-    for _ in pipeline.warm_up(pipeline.task(), config.optimizers["fields"]["optimizer"].lr):
+    for _ in warm_start(pipeline, pipeline.task, config.optimizers["fields"]["optimizer"].lr):
         pass
     for _ in range(3):
         training.step()
@@ -450,7 +456,7 @@ def test_restyling_takes_the_trainers_steps(runs: SimpleNamespace, painting: Pat
     workshop = Workshop(pipeline, runs.style, threading.Lock())
     workshop.new_field = lambda: fresh
     frozen = [view.frozen for view in pipeline.scene_views]
-    restyling = Restyling(workshop, StyleImage.read(painting), iterations=3)
+    restyling = Restyling(workshop, Painting.read(painting), iterations=3)
     steps = list(restyling)
     assert [view.frozen for view in pipeline.scene_views] == frozen  # shared, not made again
     assert steps[-1].done == 1.0 and steps[-1].seconds_left == 0.0
@@ -475,7 +481,7 @@ def test_random_numbers_of_training_go_on_as_if_there_were_no_restyling(panel: S
     torch.manual_seed(1)
     expected = torch.rand(3)
     torch.manual_seed(1)
-    fields = [panel._workshop.new_field() for _ in range(2)]
+    fields = [panel.restyling.workshop.new_field() for _ in range(2)]
     assert torch.equal(torch.rand(3), expected)
     assert all(map(torch.equal, fields[0].parameters(), fields[1].parameters()))
 

@@ -12,9 +12,9 @@ import pytest
 import torch
 from conftest import TINY_STYLE, ns_train
 
-from sparsestyle_ns.engine.trainer import HierStyleTrainer
-from sparsestyle_ns.runs.coarse_run import newest_checkpoint
-from sparsestyle_ns.runs.run_folder import load_run
+from sparsestyle_ns.engine.loading import load_run
+from sparsestyle_ns.engine.style_trainer import HierStyleTrainer
+from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 
 
 def train_with_viewer(
@@ -52,7 +52,7 @@ def train_with_viewer(
         return result
 
     monkeypatch.setattr(HierStyleTrainer, "train_iteration", iterate)
-    monkeypatch.setattr("sparsestyle_ns.viewer.panel.SECONDS_BETWEEN_TEXTS", 0.0)
+    monkeypatch.setattr("sparsestyle_ns.viewer.restyling_controls.SECONDS_BETWEEN_TEXTS", 0.0)
     viewer = ["--viewer.websocket-port", str(port), "--viewer.websocket-host", "127.0.0.1"]
     flags = ["--style-image", str(painting), "--coarse-run", str(runs.coarse), *TINY_STYLE, *viewer]
     flags += ["--max-num-iterations", str(iterations), "--vis", "viewer+tensorboard"]
@@ -74,16 +74,16 @@ def test_losses_are_shown_pausing_pauses_and_a_restyling_leaves_training_as_it_i
 
     def act(trainer: Any) -> None:
         panel = trainer.pipeline.panel
-        assert panel.training.content.startswith("Iteration 2 of 3: λ 9.55, content ")
+        assert panel.training.content.startswith("Iteration 2 of 3: content ")
         assert panel.styles[0].facts[0] == ("Painting", "painting.png")
         assert any(name == "Features" for name, _ in panel.styles[0].facts)
-        panel.path.value = str(painting)
-        panel.start.cb_hook(panel.start)
+        panel.restyling.path.value = str(painting)
+        panel.restyling.restyle_path()
         end = time.monotonic() + 60
-        while panel._busy.locked():
+        while panel.restyling.is_busy:
             assert time.monotonic() < end
             time.sleep(0.05)
-        told.append(panel.message.content)
+        told.append(panel.restyling.message.content)
         # Paused all the while, before the third iteration.
         assert trainer.step == 2 and panel.training.content.startswith("Iteration 2 of 3")
 

@@ -9,7 +9,7 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from sparsestyle_ns.models.hier_style import HierStyleModel
-from sparsestyle_ns.rendering.baked import BakedVolume, Rays, render_baked
+from sparsestyle_ns.rendering.baked import BakedVolume, render_baked
 from sparsestyle_ns.studies.tradeoff.axis import Axis, Values, in_turns
 from sparsestyle_ns.studies.tradeoff.budget import Budget
 from sparsestyle_ns.studies.tradeoff.plan import Plan
@@ -108,8 +108,6 @@ class Rendering:
 
     @torch.no_grad()
     def _baked(self, model: HierStyleModel, volume: BakedVolume, bundle: RayBundle) -> Tensor:
-        config = model.config
         segments = model.space.segments(bundle.origins, bundle.directions)
-        rays = Rays(segments, model.occupancy, config.num_steps, model.space.unbounded, config.min_transmittance)
-        fine, coarse = render_baked(volume, rays, model.background)
+        fine, coarse = render_baked(volume, segments, model.marching, model.background)
         return fine.rgb if self.study.is_stylised else coarse.rgb

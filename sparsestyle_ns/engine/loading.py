@@ -1,0 +1,76 @@
+"""Runs loaded from disk, wherever they lie now, and measured."""
+
+from pathlib import Path
+from typing import NamedTuple, Optional
+
+from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
+from sparsestyle_ns.evaluation.held_out import HeldOutReport
+from sparsestyle_ns.pipelines.base import CheckedPipeline
+from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.runs.scene_record import SceneRecord
+from sparsestyle_ns.utils.errors import InputError
+
+
+class LoadedRun(NamedTuple):
+    """A run, ready to render.
+
+    Attributes:
+        config: its settings.
+        pipeline: with the newest checkpoint loaded, in evaluation.
+        step: that checkpoint's iteration.
+    """
+
+    config: SparseStyleTrainerConfig
+    pipeline: CheckedPipeline
+    step: int
+
+
+def load_run(config_path: Path) -> LoadedRun:
+    """Loads a run, which may have been moved since it was made.
+
+    Args:
+        config_path: its config.yml.
+
+    Raises:
+        InputError: the run has no checkpoint.
+    """
+    from nerfstudio.utils.eval_utils import eval_setup  # nerfstudio's own circle: it imports all methods
+
+    folder = config_path.resolve().parent
+
+    def where_it_is_now(config: SparseStyleTrainerConfig) -> SparseStyleTrainerConfig:
+        newest = newest_checkpoint(folder / config.relative_model_dir)
+        if newest is None:
+            raise InputError(f"{folder} has no checkpoint yet; train it, or name another run.")
+        config.load_step = checkpoint_step(newest)
+        # nerfstudio joins these four to find the checkpoints, from the folder that the command was started in.
+        config.output_dir, config.experiment_name = folder.parents[2], folder.parents[1].name
+        config.method_name, config.timestamp = folder.parent.name, folder.name
+        data = config.pipeline.datamanager.data
+        if data is not None and not data.exists():
+            config.pipeline.datamanager.data = Path(SceneRecord.load(folder).data)
+        return config
+
+    config, pipeline, _, step = eval_setup(config_path, test_mode="test", update_config_callback=where_it_is_now)
+    return LoadedRun(config, pipeline, step)
+
+
+def evaluate_run(
+    config_path: Path, output_path: Path, style_image: Optional[Path] = None, baked: bool = False
+) -> HeldOutReport:
+    """Loads a run, evaluates it, and writes the report.
+
+    Args:
+        config_path: the run's config.yml.
+        output_path: JSON file to write.
+        style_image: painting to measure against; None for the one the run was made with. Where that file is gone, the
+            style losses are left out.
+        baked: whether to measure a stylised run's baked renders as well.
+
+    Raises:
+        InputError: the run has no checkpoint.
+    """
+    config, pipeline, step = load_run(config_path)
+    report = pipeline.held_out_report(style_image, baked)
+    report.save(output_path, config.experiment_name, config.method_name, step)
+    return report

@@ -1,0 +1,213 @@
+"""The trainer of stage 2: finds or trains the coarse run first."""
+
+import copy
+import shlex
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Callable, Dict, List, Literal, Optional, Type
+
+import torch
+import tyro
+from nerfstudio.utils import writer
+from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.registry import decide
+from sparsestyle_ns.effects.scene import Scene
+from sparsestyle_ns.engine.hints import scene_arguments
+from sparsestyle_ns.engine.trainer import SparseStyleTrainer, SparseStyleTrainerConfig
+from sparsestyle_ns.engine.training_step import warm_start
+from sparsestyle_ns.field_components.tiny_cuda_grid import has_tiny_cuda_nn
+from sparsestyle_ns.fields.coarse import CoarseFieldConfig
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig, StyleInputs
+from sparsestyle_ns.runs.checkpoints import CheckpointNotes, load_checkpoint
+from sparsestyle_ns.runs.coarse_run import CoarseRun, check_scene, find_coarse_run, read_coarse_run
+from sparsestyle_ns.runs.scene_record import record_scene
+from sparsestyle_ns.runs.thumbnail import save_thumbnail
+from sparsestyle_ns.utils.distributed import from_first_process
+from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
+from sparsestyle_ns.utils.progress import bar
+
+PHOTO_SETTINGS = (
+    "data",
+    "dataparser",
+    "num_views",
+    "view_ids",
+    "max_image_side",
+    "seed",
+    "camera_res_scale_factor",
+)
+"""Of the data manager: what both stages of a scene have in common."""
+
+
+@dataclass
+class HierStyleTrainerConfig(SparseStyleTrainerConfig):
+    """Settings of a stylised run."""
+
+    _target: Type = field(default_factory=lambda: HierStyleTrainer)
+    coarse_method: tyro.conf.Suppress[Optional[Callable[[], SparseStyleTrainerConfig]]] = None
+    """Gives the settings of the stage 1 that is trained first where there is no coarse run."""
+
+
+class HierStyleTrainer(SparseStyleTrainer):
+    """Trains a stylised field."""
+
+    stage = "Stage 2"
+    config: HierStyleTrainerConfig
+    pipeline: HierStylePipeline
+    _first_notes: Optional[CheckpointNotes] = None
+    """The notes of the checkpoint that is gone on with."""
+    _coarse_state: Optional[Dict[str, Tensor]] = None
+    _style: Optional[StyleInputs] = None
+
+    @exit_on_input_error
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Reads the painting and the network, makes sure of a coarse run, and sets up the stylised run."""
+        pipeline: HierStylePipelineConfig = copy.deepcopy(self.config.pipeline)
+        for name in ("style_image", "vgg_weights"):  # the run may be measured from another folder
+            path: Optional[Path] = getattr(pipeline, name)
+            setattr(pipeline, name, None if path is None else path.expanduser().resolve())
+        checkpoint = self.resumed_checkpoint()
+        if checkpoint is not None:
+            self._adopt_notes(pipeline, CheckpointNotes.of(load_checkpoint(checkpoint)))
+        self._style = pipeline.load_style()
+        pipeline.backbone = self._style.backbone.description.name
+        if checkpoint is None:
+            self._check_encoding(pipeline)
+            manager: FewShotDataManager = pipeline.datamanager.setup(device="cpu", test_mode="inference")
+            decided = decide(manager.scene, pipeline.effects)
+            run = self.coarse_run(manager, decided)
+            pipeline.coarse_run = run.folder.resolve()
+            pipeline.model.coarse_field = copy.deepcopy(run.config.pipeline.model.coarse_field)
+            pipeline.decided = self._decide(manager.scene, run, decided)
+            self._coarse_state = run.model_state()
+        self.config = replace(self.config, pipeline=pipeline)
+        super().setup(test_mode)
+        self._keep_thumbnail()
+        if self._start_step == 0:
+            self._warm_start()
+
+    def _warm_start(self) -> None:
+        steps = self.pipeline.config.warm_start_steps
+        rate = self.optimizers.optimizers["fields"].param_groups[0]["lr"]
+        with bar("Warm start", steps) as warming:
+            for _ in warm_start(self.pipeline, self.pipeline.task, rate):
+                warming.advance()
+
+    def _check_encoding(self, pipeline: HierStylePipelineConfig) -> None:
+        model = pipeline.model
+        if model.fine_encoding != "tiny-cuda-nn":
+            return
+        if not has_tiny_cuda_nn(torch.device(self.device), model.features_per_level):
+            raise InputError(
+                "--pipeline.model.fine-encoding is tiny-cuda-nn, which isn't installed here, finds no GPU, or has no "
+                f"rows of {model.features_per_level} features (but of 1, 2, 4 and 8); leave the setting out: the hash "
+                "grid has kernels of its own."
+            )
+
+    @check_main_thread
+    def _keep_thumbnail(self) -> None:
+        save_thumbnail(self.base_dir, self._style.painting)
+
+    def notes(self) -> CheckpointNotes:
+        """Which feature network stylised the scene, where its weights came from, and which coarse run it builds on."""
+        pipeline = self.config.pipeline
+        backbone, first = asdict(self.pipeline.targets.backbone.description), self._first_notes
+        if first is not None and first.backbone is not None and first.backbone["sha256"] == backbone["sha256"]:
+            backbone = first.backbone  # how it was found when the run began
+        return replace(
+            super().notes(),
+            backbone=backbone,
+            coarse_run=str(pipeline.coarse_run),
+            coarse_field=asdict(pipeline.model.coarse_field),
+            fine_encoding=self.pipeline.model.config.fine_encoding,
+        )
+
+    def _load_checkpoint(self) -> None:
+        super()._load_checkpoint()
+        self.pipeline.style_inputs = self._style
+        if self._coarse_state is not None:
+            self.pipeline.model.adopt_coarse(self._coarse_state)
+            self._coarse_state = None
+
+    def _adopt_notes(self, pipeline: HierStylePipelineConfig, notes: CheckpointNotes) -> None:
+        """Takes from the run that is resumed what was found out when it began: the coarse field, and what auto was.
+
+        Its config.yml may be this command's own by now, where training goes on in the same folder.
+        """
+        if notes.coarse_field is None:  # a coarse run's; loading it says what is wrong
+            return
+        self._first_notes = notes
+        pipeline.model.coarse_field = CoarseFieldConfig(**notes.coarse_field)
+        pipeline.coarse_run = Path(notes.coarse_run)
+        if pipeline.model.fine_encoding == "auto":
+            pipeline.model.fine_encoding = notes.fine_encoding
+        if pipeline.backbone == "auto" and pipeline.vgg_weights is None:
+            pipeline.backbone = notes.backbone["name"]
+
+    def coarse_run(self, manager: FewShotDataManager, decided: Decisions) -> CoarseRun:
+        """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now.
+
+        Args:
+            manager: the photos.
+            decided: what was decided about them.
+
+        Raises:
+            InputError: the run that was asked for doesn't exist or is of another scene.
+        """
+        scene = record_scene(manager.config.data, manager.train_dataparser_outputs, decided)
+        asked = self.config.pipeline.coarse_run
+        if asked is not None:
+            run = read_coarse_run(asked)
+            check_scene(run, scene)
+            CONSOLE.print(f"Stylising the coarse run {run.in_words()}.", soft_wrap=True)
+            return run
+        draft = self.config.method_name.endswith("-draft")
+        methods = ("coarse-fewshot", "coarse-fewshot-draft") if draft else ("coarse-fewshot",)
+        found = from_first_process(find_coarse_run(self.config.output_dir, methods, scene))
+        if found is not None:
+            CONSOLE.print(f"Stylising the newest coarse run of this scene, {found.folder}.")
+            return found
+        CONSOLE.print("There is no finished coarse run of this scene and these views; training one first.")
+        return self._train_coarse(decided)
+
+    def _decide(self, scene: Scene, run: CoarseRun, decided: Decisions) -> Decisions:
+        """What is simulated: as in the coarse run, and the rest by its field and the painting."""
+        scene.coarse_density = run.density(decided)
+        scene.style_image = self._style.painting.pixels
+        return decide(scene, self.config.pipeline.effects, decided)
+
+    def _train_coarse(self, decided: Decisions) -> CoarseRun:
+        config, ours = self.config.coarse_method(), self.config
+        for name in PHOTO_SETTINGS:
+            setattr(config.pipeline.datamanager, name, copy.deepcopy(getattr(ours.pipeline.datamanager, name)))
+        config.pipeline.effects, config.pipeline.decided = ours.pipeline.effects, decided
+        for name in ("data", "output_dir", "experiment_name", "project_name", "machine", "logging"):
+            setattr(config, name, getattr(ours, name))
+        config.vis = "tensorboard"
+        config.viewer.quit_on_train_completion = True
+        config.set_timestamp()
+        config.timestamp = from_first_process(config.timestamp)
+        if self.local_rank == 0:
+            config.save_config()
+        trainer = config.setup(local_rank=self.local_rank, world_size=self.world_size)
+        trainer.setup()
+        trainer.train_to_end()
+        if trainer._interrupted:
+            method = config.method_name
+            resume = ["ns-train", method, "--load-dir", str(trainer.checkpoint_dir), *scene_arguments(config)]
+            raise InputError(
+                "The coarse run was interrupted, so there is nothing to stylise yet; finish it with "
+                f"{shlex.join(resume)} and run this command again."
+            )
+        for state in (writer.EVENT_WRITERS, writer.EVENT_STORAGE, writer.GLOBAL_BUFFER):
+            state.clear()
+        from_first_process(None)  # the others wait here until it has saved
+        return read_coarse_run(trainer.base_dir)
+
+    def next_command(self) -> List[str]:
+        """See `SparseStyleTrainer.next_command`."""
+        return ["sparsestyle", "gallery", str(self.base_dir)]

@@ -1,0 +1,82 @@
+"""The field that is stylised, as the settings have it: the residual field, or a copy of the coarse one."""
+
+import copy
+from dataclasses import dataclass
+from typing import Literal, Union
+
+import torch
+
+from sparsestyle_ns.field_components.hash_grid import HashGrid
+from sparsestyle_ns.field_components.point_encodings import FrequencyEncoding, NoEncoding, PointEncoding
+from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid, has_tiny_cuda_nn
+from sparsestyle_ns.fields.coarse import CoarseField
+from sparsestyle_ns.fields.fine_tuned import FineTunedField
+from sparsestyle_ns.fields.residual import ResidualField
+
+StylisedField = Union[ResidualField, FineTunedField]
+"""Gives σ_f and c_f at located points, from σ_c and e_c there."""
+
+
+@dataclass
+class FineFieldConfig:
+    """Settings of the stylised field."""
+
+    stylised_field: Literal["residual", "coarse"] = "residual"
+    """What learns the style: the residual field on top of the frozen coarse field (Eq. 2 and 3), or a copy of the
+    coarse field, fine-tuned as ARF does. With the copy, the settings of the residual field are not used."""
+    fine_encoding: Literal["auto", "hash", "tiny-cuda-nn", "frequency", "none"] = "auto"
+    """What the residual field gets of a position beside e_c: our hash grid, tiny-cuda-nn's hash grid, sines and
+    cosines of `frequency_levels` octaves, or nothing. auto is tiny-cuda-nn's on a GPU where that library is installed,
+    else ours."""
+    frequency_levels: int = 10
+    """Octaves of the sines and cosines, where they take the hash grid's place."""
+    hash_levels: int = 8
+    """Levels of the hash grid (M)."""
+    min_resolution: int = 128
+    """Cells along the cube's side on the first level (N_min)."""
+    max_resolution: int = 512
+    """Cells along the cube's side on the last level (N_max)."""
+    features_per_level: int = 4
+    """Features of a cell's corner."""
+    log2_table_size: int = 19
+    """log2 of a level's table length."""
+    hidden_layers: int = 2
+    """Hidden layers of the residual field's MLP."""
+    layer_width: int = 256
+    """Units in a hidden layer."""
+    residual_density_scale: float = 10.0
+    """Unit of the residual density, per half side of the scene's cube."""
+
+    def settle_encoding(self, device: torch.device) -> None:
+        """Replaces auto by what it stands for on a device, so that a run is opened as what it was trained as."""
+        if self.fine_encoding == "auto":
+            is_there = has_tiny_cuda_nn(device, self.features_per_level)
+            self.fine_encoding = "tiny-cuda-nn" if is_there else "hash"
+
+    def new_field(self, coarse: CoarseField, with_density: bool, device: torch.device) -> StylisedField:
+        """A field as it is before training.
+
+        Args:
+            coarse: the field to stylise; a copy of it starts from its weights.
+            with_density: whether a residual field has a residual density.
+            device: where the field will be used.
+        """
+        if self.stylised_field == "coarse":
+            return FineTunedField(copy.deepcopy(coarse).requires_grad_(True))
+        return ResidualField(
+            grid=self._encoding(device),
+            feature_dim=coarse.feature_dim,
+            hidden_layers=self.hidden_layers,
+            layer_width=self.layer_width,
+            density_scale=self.residual_density_scale,
+            with_density=with_density,
+        )
+
+    def _encoding(self, device: torch.device) -> PointEncoding:
+        if self.fine_encoding == "none":
+            return NoEncoding()
+        if self.fine_encoding == "frequency":
+            return FrequencyEncoding(self.frequency_levels)
+        resolutions = self.min_resolution, self.max_resolution
+        shape = (self.hash_levels, *resolutions, self.features_per_level, self.log2_table_size)
+        return TinyCudaGrid(*shape, device=device) if self.fine_encoding == "tiny-cuda-nn" else HashGrid(*shape)

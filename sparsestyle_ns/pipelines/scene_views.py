@@ -1,0 +1,189 @@
+"""The views that stage 2 stylises: their rays, frozen, and the pictures that they must stay like.
+
+`SceneView` holds what depends on no painting, and is shared by all styles of a scene; `ContentView` adds what does.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import List, Optional
+
+import psutil
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor, nn
+
+from sparsestyle_ns.core.camera_paths import at_poses, poses_between
+from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.losses.stylization import StyleTargets
+from sparsestyle_ns.models.hier_style import HierStyleModel
+from sparsestyle_ns.pipelines.datamanager import TrainingPixels
+from sparsestyle_ns.rendering.frozen_view import FrozenView
+from sparsestyle_ns.rendering.render import accumulation_of, seen_behind
+from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
+from sparsestyle_ns.utils.distributed import gather_rays, num_processes, shard_rays
+from sparsestyle_ns.utils.progress import track
+
+
+@dataclass
+class SceneView:
+    """A view that is stylised, as far as it depends on no style.
+
+    Attributes:
+        frozen: its rays, ready to render.
+        picture: its photo at the mean exposure, or its coarse render.
+        accumulation: how opaque the coarse field is in each pixel.
+        features: the feature network's view of the picture, once a style has asked for it.
+    """
+
+    frozen: FrozenView
+    picture: Float[Tensor, "H W 3"]
+    accumulation: Float[Tensor, "H W"]
+    features: Optional[Float[Tensor, "1 C h w"]] = None
+
+
+@dataclass
+class ContentView:
+    """A view that is stylised, and what it must stay like.
+
+    Attributes:
+        frozen: its rays, ready to render.
+        picture: its photo or coarse render, in the painting's colours where the palette is transferred.
+        features: the feature network's view of it.
+        accumulation: how opaque the coarse field is in each pixel; None where there is no background behind it.
+    """
+
+    frozen: FrozenView
+    picture: Float[Tensor, "H W 3"]
+    features: Float[Tensor, "1 C h w"]
+    accumulation: Optional[Float[Tensor, "H W"]]
+
+
+class SceneViews:
+    """All views of a scene: its training photos and, after them, views between these.
+
+    Args:
+        model: whose coarse field is final.
+        pixels: of the photos.
+        cameras: of the photos.
+        novel_views: how many views between the photos there are.
+        samples_per_chunk: samples that are rendered at once, at most.
+        cache_gigabytes: memory for what never changes; None: a quarter of what is free.
+    """
+
+    @torch.no_grad()
+    def __init__(
+        self,
+        model: HierStyleModel,
+        pixels: TrainingPixels,
+        cameras: Cameras,
+        novel_views: int,
+        samples_per_chunk: int,
+        cache_gigabytes: Optional[float],
+    ) -> None:
+        self.model, self.samples_per_chunk = model, samples_per_chunk
+        self.num_photos = len(pixels.sizes)
+        self._bytes_left = self._cache_bytes(cache_gigabytes)
+        self.views: List[SceneView] = [
+            self._photo_view(pixels, index) for index in track(range(self.num_photos), "Caching views")
+        ]
+        novel = cameras_between(cameras, novel_views)
+        self.views += [self._novel_view(camera) for camera in track(novel, "Caching novel views")]
+
+    def _cache_bytes(self, gigabytes: Optional[float]) -> float:
+        if gigabytes is not None:
+            return gigabytes * 2**30
+        on_gpu = self.model.device.type == "cuda"
+        free = torch.cuda.mem_get_info()[0] if on_gpu else psutil.virtual_memory().available
+        return free / 4 / num_processes()
+
+    def _freeze(self, origins: Tensor, directions: Tensor) -> FrozenView:
+        """The rays of a view that this process renders."""
+        rays = shard_rays(origins), shard_rays(directions)
+        frozen = self.model.freeze_view(*rays, self.samples_per_chunk, self._bytes_left)
+        self._bytes_left -= frozen.kept_bytes
+        return frozen
+
+    def _photo_view(self, pixels: TrainingPixels, index: int) -> SceneView:
+        height, width = pixels.sizes[index]
+        rows = slice(pixels.starts[index], pixels.starts[index + 1])
+        frozen = self._freeze(pixels.origins[rows], pixels.directions[rows])
+        accumulation = gather_rays(frozen.render(accumulation_of), height * width)
+        colors, exposure = pixels.colors[rows], self.model.exposure
+        if exposure is not None:
+            colors = exposure.undone(colors, seen_behind(accumulation, self.model.background), index)
+        return SceneView(frozen, colors.view(height, width, 3), accumulation.view(height, width))
+
+    def _novel_view(self, camera: Cameras) -> SceneView:
+        bundle = camera.generate_rays(camera_indices=0, keep_shape=True).to(self.model.device)
+        rays = bundle.flatten()
+        with self.model.rendering("exact"):  # a viewer may restyle a run whose pictures are baked
+            outputs = self.model.get_outputs_for_camera_ray_bundle(bundle)
+        frozen = self._freeze(rays.origins, rays.directions)
+        return SceneView(frozen, outputs["rgb_coarse"], outputs["accumulation_coarse"].squeeze(-1))
+
+    @torch.no_grad()
+    def for_painting(self, targets: StyleTargets, effects: Decisions) -> List[ContentView]:
+        """The views with what they must stay like for one painting."""
+        pictures = [view.picture for view in self.views]
+        if effects.on("palette"):
+            pictures = self._in_style_colors(targets)
+        return [
+            ContentView(
+                view.frozen,
+                picture,
+                self._features(view, picture, targets),
+                None if self.model.background is None else view.accumulation,
+            )
+            for view, picture in zip(self.views, pictures, strict=True)
+        ]
+
+    @staticmethod
+    def _features(view: SceneView, picture: Tensor, targets: StyleTargets) -> Tensor:
+        """Content features; those of a view's own picture are the same for every painting."""
+        if picture is not view.picture:
+            return targets.features(picture)
+        if view.features is None:
+            view.features = targets.features(picture)
+        return view.features
+
+    def _in_style_colors(self, targets: StyleTargets) -> List[Tensor]:
+        """Pictures with the painting's colours; where the scene is transparent the background stays as it is."""
+        photos = self.views[: self.num_photos]
+        colors = torch.cat([view.picture.reshape(-1, 3) for view in photos])
+        weight = torch.cat([view.accumulation.reshape(-1) for view in photos])
+        style = color_moments(targets.style_image.permute(1, 2, 0).reshape(-1, 3))
+        matrix, offset = palette_transform(*color_moments(colors, weight), *style)
+        transferred = [apply_palette(view.picture, matrix, offset, clamp=True) for view in self.views]
+        if self.model.background is None:
+            return transferred
+        return [
+            torch.lerp(view.picture, changed, view.accumulation[..., None].clamp(0.0, 1.0))
+            for view, changed in zip(self.views, transferred, strict=True)
+        ]
+
+    def render(self, view: ContentView, style: nn.Module, coarse_geometry: bool = False) -> Float[Tensor, "H W 3"]:
+        """The stylised picture of a view, of which each process renders its share of the rays; differentiable."""
+        own = view.frozen.render(lambda chunk: self.model.stylised(chunk, coarse_geometry, style).rgb)
+        return gather_rays(own, view.picture[..., 0].numel()).view(view.picture.shape)
+
+    def report(self) -> str:
+        """What is kept in memory, in a line."""
+        frozen = [view.frozen for view in self.views]
+        kept, chunks = sum(view.kept_bytes for view in frozen), sum(view.num_chunks for view in frozen)
+        whole = sum(view.is_kept for view in frozen)
+        occupancy = self.model.occupancy
+        occupied = "" if occupancy is None else f", {occupancy.share:.0%} of space occupied"
+        note = "" if whole == len(frozen) else "; the rest is computed again in each iteration"
+        return f"{len(frozen)} views in {chunks} chunks{occupied}; {whole} views kept in {kept / 2**20:.0f} MiB{note}."
+
+
+def cameras_between(cameras: Cameras, count: int) -> List[Cameras]:
+    """`count` cameras half way, a third of the way … between neighbouring ones; none between fewer than two."""
+    if count == 0 or len(cameras) < 2:
+        return []
+    gaps = len(cameras) - 1
+    steps = math.ceil(count / gaps) + 1
+    path = poses_between(cameras.camera_to_worlds.cpu(), gaps * steps + 1)
+    between = [pose for place, pose in enumerate(path) if place % steps]
+    return [at_poses(pose[None], cameras) for pose in between[:count]]

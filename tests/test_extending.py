@@ -1,0 +1,117 @@
+"""What docs/development.md says of adding a loss, a feature network or a dataset: each is one class and one line."""
+
+import copy
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+import tyro
+
+from sparsestyle_ns.engine.loading import load_run
+from sparsestyle_ns.engine.training import Training
+from sparsestyle_ns.evaluation.held_out import stylisation_figures
+from sparsestyle_ns.losses.base import PaintingFeatures, StylizationLoss, StylizedView
+from sparsestyle_ns.losses.stylization import LOSSES
+from sparsestyle_ns.metrics.gram import gram_matrix
+from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
+from sparsestyle_ns.runs.coarse_run import read_coarse_run
+from sparsestyle_ns.style.backbone import Backbone, Weights
+from sparsestyle_ns.style.backbones import BACKBONES, load_backbone
+
+
+class BrightnessLoss(StylizationLoss):
+    """How much lighter or darker a view is than the painting."""
+
+    def __init__(self, painting: PaintingFeatures) -> None:
+        self.brightness = painting.image.mean()
+
+    def __call__(self, view: StylizedView) -> torch.Tensor:
+        return (view.image.mean() - self.brightness).abs()
+
+
+class Patches(Backbone):
+    """Each 4 × 4 block of pixels has its own colours as features."""
+
+    name = "patches"
+    channels = 48
+    smallest_side = 4
+    folder = Path()
+
+    def __init__(self, weights: Weights) -> None:
+        super().__init__()
+        self.description = weights.describe(self.name)
+        self.register_buffer("scale", torch.ones(()))
+
+    @classmethod
+    def find_weights(cls) -> Weights:
+        return Weights(cls.folder / "patches.pth", "a file of its own")
+
+    @classmethod
+    def how_to_get(cls) -> str:
+        return "make patches.pth"
+
+    @classmethod
+    def why_absent(cls) -> str:
+        return "patches.pth isn't there"
+
+    @classmethod
+    def accepts(cls, state: dict) -> bool:
+        return "patches" in state
+
+    @classmethod
+    def load(cls, weights: Weights, state: dict) -> "Patches":
+        return cls(weights).eval()
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return self.scale * torch.nn.functional.pixel_unshuffle(images, 4)
+
+
+def training_of(runs: SimpleNamespace, **settings: object) -> Training:
+    """A stylised run's training from its start, with other settings of the pipeline."""
+    config = copy.deepcopy(load_run(runs.style / "config.yml").config)
+    for name, value in settings.items():
+        setattr(config.pipeline, name, value)
+    return Training(config, torch.device("cpu"), read_coarse_run(runs.coarse).model_state())
+
+
+def test_a_new_loss_is_trained_measured_and_has_a_flag(runs: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(LOSSES, "brightness", BrightnessLoss)
+    given = tyro.cli(HierStylePipelineConfig, args=["--loss-weights.brightness", "0.5"])
+    assert given.loss_weights == {"content": 10.0, "style": 1.0, "brightness": 0.5}
+
+    training = training_of(runs, loss_weights=given.loss_weights)
+    pipeline = training.pipeline
+    told = []
+    pipeline.on_losses = lambda step, losses: told.append(losses)
+    training.step()
+    assert told[0].terms().keys() == {"content_loss", "style_loss", "brightness_loss"}
+    assert told[0].terms()["brightness_loss"] == 0.5 * told[0].values["brightness"]
+    assert "brightness" in told[0].metrics()
+
+    view, targets = pipeline.task.views[0].picture, pipeline.targets
+    figures = stylisation_figures(targets, gram_matrix(targets.style_rows()), view, view.flip(0), None)
+    assert figures["brightness_loss"] == pytest.approx(figures["brightness_loss_before"], abs=1e-6)
+
+
+def test_a_loss_without_weight_is_not_computed(runs: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Refusing(BrightnessLoss):
+        def __call__(self, view: StylizedView) -> torch.Tensor:
+            raise AssertionError("it was computed")
+
+    monkeypatch.setitem(LOSSES, "refusing", Refusing)
+    training_of(runs, loss_weights={"content": 0.0, "style": 1.0, "refusing": 0.0}).step()
+
+
+def test_a_new_feature_network_brings_its_width_and_its_least_side(
+    runs: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.save({"patches": torch.ones(1)}, tmp_path / "patches.pth")
+    monkeypatch.setattr(Patches, "folder", tmp_path)
+    monkeypatch.setitem(BACKBONES, "patches", Patches)
+    assert load_backbone("auto", tmp_path / "patches.pth").description.name == "patches"
+
+    training = training_of(runs, backbone="patches")
+    assert training.step().isfinite()
+    assert training.pipeline.task.views[0].features.shape[1] == 48
+    assert training.pipeline.targets.features(torch.rand(1, 40, 3)).shape[2] == 1
