@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from nerfstudio.cameras.camera_utils import radial_and_tangential_undistort
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from sparsestyle_ns.data.features import find_features, mutual_matches
+from sparsestyle_ns.data.features import find_features, linked_groups, mutual_matches
 
 MAX_FEATURES, MIN_CONTRAST, MAX_RATIO = 2000, 0.02, 0.8
 """Of the matcher (`features`); lenient, as the known cameras sort out wrong matches."""
@@ -50,13 +50,9 @@ class PointMatches:
 
     def fewest_in_a_view(self) -> int:
         """Matches of the photo that has fewest; 0 where matches don't link all photos to each other."""
-        counts = np.zeros((self.num_views, self.num_views), dtype=int)
-        np.add.at(counts, tuple(self.views), 1)
-        counts += counts.T
-        reached = np.eye(self.num_views, dtype=bool)
-        for _ in range(self.num_views):
-            reached = reached | (reached @ (counts > 0))
-        return int(counts.sum(axis=1).min()) if reached.all() else 0
+        if len(linked_groups(self.num_views, np.unique(self.views, axis=1).T.tolist())) > 1:
+            return 0
+        return int(np.bincount(self.views.ravel(), minlength=self.num_views).min())
 
 
 @dataclass

@@ -8,14 +8,14 @@ lies in the middle of the picture, it moved along its line of sight.
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Dict, List, Optional, Sequence, Set, Tuple
+from typing import Dict, List, Optional, Sequence, Tuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from sparsestyle_ns.data.features import Features, find_features, mutual_matches
+from sparsestyle_ns.data.features import Features, find_features, linked_groups, mutual_matches
 from sparsestyle_ns.utils.progress import track
 
 COMPARED_SIDE = 1000
@@ -111,7 +111,8 @@ def _faint(features: Sequence[Features], names: Sequence[str]) -> List[str]:
 
 
 def _unlinked(pairs: Dict[Tuple[int, int], Pair], names: Sequence[str]) -> List[str]:
-    groups = sorted(linked_groups(pairs, len(names)), key=lambda group: (-len(group), min(group)))
+    links = [ids for ids, pair in pairs.items() if pair.linked]
+    groups = sorted(linked_groups(len(names), links), key=lambda group: (-len(group), min(group)))
     if len(groups) == len(names):
         return [
             "No two photos share enough: they have too few matches to tell where the camera stood; take photos that "
@@ -129,28 +130,16 @@ def _unlinked(pairs: Dict[Tuple[int, int], Pair], names: Sequence[str]) -> List[
     return sentences
 
 
-def linked_groups(pairs: Dict[Tuple[int, int], Pair], count: int) -> List[Set[int]]:
-    """Photos that are linked to each other, directly or by way of others."""
-    groups = [{index} for index in range(count)]
-    for (first, second), pair in pairs.items():
-        if pair.linked:
-            one, other = (next(group for group in groups if index in group) for index in (first, second))
-            if one is not other:
-                groups.remove(other)
-                one |= other
-    return groups
-
-
 def _without_depth(pairs: Dict[Tuple[int, int], Pair], names: Sequence[str]) -> List[str]:
     linked = [pair for pair in pairs.values() if pair.linked]
     if not linked:
         return []
     if not any(pair.has_depth for pair in linked):
         return [
-            "The camera turned without moving, or all that it sees is flat or far away: the photos differ as if they "
-            "were bent, and no depth can be told; take a step to the side between photos."
+            "The camera turned without moving, or all that it sees is flat or far away: each photo is a "
+            "warped copy of another, from which depth can't be told; take a step to the side between photos."
         ]
-    # A short move's epipole is uncertain, so that one pair may have it anywhere.
+    # A short move's epipole is uncertain, so one pair alone says little.
     if np.median([np.linalg.norm(pair.epipole) for pair in linked if pair.has_depth]) < AXIS_SHARE:
         return [
             "The camera moved only along its line of sight, where what is in the middle looks the same from "
