@@ -74,12 +74,13 @@ class ForwardFacingSegments(LinearSegments):
     directions: Float[Tensor, "rays 3"]
     near: float
     first: Float[Tensor, "rays 1"]
-    last: float
+    last: Float[Tensor, "rays 1"]
 
     def distance(self, s: Tensor) -> Tensor:
         """See `Segments.distance`."""
         t_ndc = self.first + s * (self.last - self.first)
-        return ndc_distance(t_ndc, self.origins, self.directions, self.near, max_distance=MAX_DISTANCE * self.near)
+        distance = ndc_distance(t_ndc, self.origins, self.directions, self.near, MAX_DISTANCE * self.near)
+        return distance.clamp(min=0.0)  # a ray may start at its own origin, but for rounding
 
     def at_distance(self, distance: Tensor) -> Tensor:
         """See `Segments.at_distance`."""
@@ -244,21 +245,21 @@ class ForwardFacingSpace(Space):
     def segments(self, origins: Tensor, directions: Tensor) -> ForwardFacingSegments:
         """See `Space.segments`."""
         start, extent, valid = ndc_rays(origins, directions, self.focal_over_half_size, self.near)
-        hit = valid.squeeze(-1)
+        # A camera that has flown past the nearest thing doesn't see what is behind it, and past the farthest, nothing.
+        own = ndc_parameter(torch.zeros_like(origins[:, :1]), origins, directions, self.near)
+        first, last = own.clamp(min=self.first), own.clamp(min=self.last)
+        hit = (valid & (first < last)).squeeze(-1)
         size = self.maximum - self.minimum
         scale = 2.0 / torch.where(size > 0, size, 2.0)
-        # A camera that has flown past the nearest thing doesn't see what is behind it.
-        own = ndc_parameter(torch.zeros_like(origins[:, :1]), origins, directions, self.near)
-        first = own.clamp(self.first, self.last)
         return ForwardFacingSegments(
             start=(start + first * extent - self.minimum) * scale - 1.0,
-            extent=(self.last - first) * extent * scale * hit[:, None],
+            extent=(last - first) * extent * scale * hit[:, None],
             hit=hit,
             origins=origins,
             directions=directions,
             near=self.near,
             first=first,
-            last=self.last,
+            last=last,
         )
 
 
