@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from sparsestyle_ns.cli import SUBCOMMANDS, main
-from sparsestyle_ns.gallery import collect
-from sparsestyle_ns.gallery import page as gallery_page
+from sparsestyle_ns.gallery import make_gallery
+from sparsestyle_ns.gallery.film import read_film
 
 
 def run_main(arguments, capsys):
@@ -87,12 +87,12 @@ def test_gallery_gives_each_run_its_video_and_says_last_where_the_page_is(tmp_pa
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.yml").write_text("method_name: hier-style\n")
     pages = []
-    monkeypatch.setattr(collect, "collect_run", lambda *given: given)
-    monkeypatch.setattr(gallery_page, "gallery_page", lambda *given: pages.append(given) or "<html>")
+    monkeypatch.setattr(make_gallery, "collect_run", lambda *given: given)
+    monkeypatch.setattr(make_gallery, "gallery_page", lambda *given: pages.append(given) or "<html>")
     target = tmp_path / "page.html"
     given = [str(tmp_path / "first"), str(tmp_path / "second" / "config.yml"), "--output-path", str(target)]
     main(["gallery", *given, "--video", str(film), "--title", "Two scenes", "--num-views", "2", "--frames", "0"])
-    runs = [(tmp_path / "first" / "config.yml", film, 2, 0, False)]
+    runs = [(tmp_path / "first", read_film(film), 2, 0, False)]
     runs.append((tmp_path / "second" / "config.yml", None, 2, 0, False))
     assert pages == [(runs, "Two scenes")]
     assert target.read_text() == "<html>"

@@ -7,7 +7,7 @@ from sparsestyle_ns.effects.exposure import DARK, fit_gains, not_measurable
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_VIEWS = 6
-"""Photos below which shine can't be told from shape (README, Where we depart from the paper)."""
+"""Photos below which shine can't be told from shape (docs/method.md)."""
 NOISE = 0.05
 """Difference of matched colours, of a range of 1, that noise and inexact matches explain."""
 MIN_SHARE = 0.08

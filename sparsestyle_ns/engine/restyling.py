@@ -135,7 +135,7 @@ class Restyling:
     def __iter__(self) -> Iterator[Progress]:
         yield Progress(f"Looking at {self.image.name}")
         backbone = self.workshop.backbone()
-        targets = self.pipeline.config.targets_of(StyleInputs(self.image, backbone))
+        targets = self.pipeline.config.targets_of(StyleInputs(self.image, backbone), self.pipeline.device)
         self.effects = self._decide()
         if self.pipeline.scene_views is None:
             yield Progress("Preparing the views, which the next style won't need")

@@ -1,29 +1,58 @@
 """A coloured mesh of a scene's surfaces, made as nerfstudio's `ns-export poisson` makes one, with Open3D.
 
 The points are those of the training views, not of random rays, and every vertex has the colour of the points around it.
+Importing this module raises an `InputError` where Open3D can't be loaded.
 """
 
+import tempfile
 from pathlib import Path
 from typing import Tuple
 
 import numpy as np
-import open3d
 import torch
 from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sparsestyle_ns.export.points import Points
+from sparsestyle_ns.export.points import Points, joined, likeness, print_likeness, surfaces
+from sparsestyle_ns.export.stylised_scene import StylisedScene
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import write_output
+
+try:
+    import open3d
+except (ImportError, OSError) as error:
+    raise InputError(
+        f"Open3D, which makes the mesh, can't be loaded ({error}): install the libraries that it needs, on Debian and "
+        "Ubuntu with apt-get install libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6, or choose --format ply."
+    ) from error
 
 OCTREE_DEPTH = 9
 """Levels of the Poisson solver's octree, as in `ns-export poisson`."""
 THIN_SHARE = 0.1
-"""Share of the vertices, those with the fewest points around them, that are no surface (as in `ns-export poisson`)."""
+"""Share of the vertices, those with the fewest points around them, that are dropped (as in `ns-export poisson`)."""
 NORMAL_NEIGHBOURS = 30
 FAR = 4.0
-"""Vertices farther from any point than this many times the points' usual distance from each other are invented."""
+"""Vertices farther from any point than this many times the points' median distance from each other are dropped: the
+reconstruction closes holes with them."""
 MIN_POINTS = 100
+
+
+def export_mesh(scene: StylisedScene, output_path: Path) -> None:
+    """Writes a mesh with coloured vertices as PLY, and prints how well it shows each training view.
+
+    Raises:
+        InputError: there are too few surface points, or the file can't be written.
+    """
+    pictures, parts = surfaces(scene)
+    mesh = poisson_mesh(joined(parts))
+    write_output(output_path, encode_mesh(mesh), "The mesh", "scene.ply")
+    print(f"{len(mesh.vertices):,} vertices, {len(mesh.triangles):,} triangles, in nerfstudio's coordinates")
+    print("The mesh without light against the exact render:")
+    found = []
+    for index, picture in enumerate(pictures):
+        found.append(likeness(*picture_of_mesh(mesh, scene.cameras[index : index + 1]), picture))
+    print_likeness(scene.names, found)
 
 
 def poisson_mesh(points: Points) -> open3d.geometry.TriangleMesh:
@@ -52,12 +81,13 @@ def poisson_mesh(points: Points) -> open3d.geometry.TriangleMesh:
     return mesh
 
 
-def encode_mesh(mesh: open3d.geometry.TriangleMesh, folder: Path) -> bytes:
-    """A binary PLY file with the vertices' colours and normals; Open3D writes it by way of a folder."""
+def encode_mesh(mesh: open3d.geometry.TriangleMesh) -> bytes:
+    """A binary PLY file with the vertices' colours and normals."""
     mesh.compute_vertex_normals()
-    path = folder / "mesh.ply"
-    open3d.io.write_triangle_mesh(str(path), mesh)
-    return path.read_bytes()
+    with tempfile.TemporaryDirectory() as folder:  # Open3D only writes into files
+        path = Path(folder) / "mesh.ply"
+        open3d.io.write_triangle_mesh(str(path), mesh)
+        return path.read_bytes()
 
 
 def picture_of_mesh(

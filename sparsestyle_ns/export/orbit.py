@@ -1,12 +1,12 @@
-"""Cameras of the page: the training views as pinholes, and how far one may turn away from the one it opens with.
+"""Cameras of the page: the training views as pinholes, and how far the user may turn away from the opening one.
 
 A turned camera is the opening one, first pitched about its own right axis and then yawed about the scene's up axis,
-both through a target on its line of sight. The page does the same (`turnedPose` in page.js).
+both through a target on its line of sight. The page does the same (`turnedPose` in web_page.js).
 """
 
 import math
 from dataclasses import dataclass
-from typing import Iterator, List, Tuple
+from typing import List, Optional, Tuple
 
 import torch
 from jaxtyping import Float
@@ -18,12 +18,12 @@ from sparsestyle_ns.core.spaces import BoxSpace, ForwardFacingSpace, Space
 STEEPEST = 85.0
 """Degrees above or below the horizon that a camera may look from."""
 LEAST_TURN, MOST_TURN = 5.0, 30.0
-"""Degrees that a camera may be turned by in a forward-facing scene, wherever its photos were taken: farther out is what
-no photo shows, and the fields there are guesses of which a page and the exact render show different ones."""
+"""Degrees that a camera may be turned by in a forward-facing scene, wherever its photos were taken. Beyond lies what no
+photo shows: the fields have arbitrary values there, and the page would differ from the exact render."""
 BEYOND_PHOTOS = 1.5
 """How far cameras of a forward-facing scene may turn, as a multiple of the largest angle between two photos."""
 SURVEY_SIDE = 96
-"""Pixels along the longer side of the pictures that find out what can be seen."""
+"""Pixels along the longer side of the pictures by which it is found out what can be seen."""
 
 
 @dataclass
@@ -46,27 +46,18 @@ class Orbit:
     distance: Tuple[float, float]
 
 
-def pinholes(cameras: Cameras) -> Cameras:
-    """The same cameras without distortion, which a page doesn't draw."""
-    return Cameras(
-        camera_to_worlds=cameras.camera_to_worlds,
-        fx=cameras.fx,
-        fy=cameras.fy,
-        cx=cameras.cx,
-        cy=cameras.cy,
-        width=cameras.width,
-        height=cameras.height,
-        camera_type=CameraType.PERSPECTIVE,
-    )
+def pinholes(cameras: Cameras, longest: Optional[int] = None) -> Cameras:
+    """The same cameras without distortion, which a page doesn't draw.
 
-
-def resized(camera: Cameras, longest: int) -> Cameras:
-    """One camera with at most `longest` pixels along its longer side."""
-    smaller = pinholes(camera)
-    scale = longest / int(max(camera.width.max(), camera.height.max()))
-    if scale < 1.0:
-        smaller.rescale_output_resolution(scale)
-    return smaller
+    Args:
+        longest: pixels along the longer side, at most; None for all that they have.
+    """
+    names = ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height")
+    plain = Cameras(**{name: getattr(cameras, name) for name in names}, camera_type=CameraType.PERSPECTIVE)
+    side = int(max(cameras.width.max(), cameras.height.max()))
+    if longest is not None and longest < side:
+        plain.rescale_output_resolution(longest / side)
+    return plain
 
 
 def most_central(cameras: Cameras) -> int:
@@ -76,12 +67,12 @@ def most_central(cameras: Cameras) -> int:
 
 
 def make_orbit(space: Space, cameras: Cameras, opening: int, depth: float) -> Orbit:
-    """Where one may go from the camera `opening` without leaving what the photos tell of.
+    """Where the camera may go from `opening` and still show what the photos have shown.
 
     Around an object (box) the target is beside its centre, elsewhere at the depth of what the camera sees.
 
     Args:
-        depth: how far what the opening camera sees is away, in world units.
+        depth: distance of what the opening camera sees, in world units.
     """
     pose = cameras.camera_to_worlds[opening]
     position, forward = pose[:, 3], -pose[:, 2]
@@ -93,7 +84,7 @@ def make_orbit(space: Space, cameras: Cameras, opening: int, depth: float) -> Or
         around = torch.nn.functional.normalize(cameras.camera_to_worlds[..., 3] - target, dim=-1)
         widest = math.degrees(math.acos(float((around @ around.T).amin().clamp(-1.0, 1.0))))
         turn = min(max(BEYOND_PHOTOS * widest, LEAST_TURN), MOST_TURN)
-        # NDC has nothing in front of the near plane, and cameras beyond it would see what is behind them.
+        # NDC has nothing in front of the near plane: a camera beyond it would see what is behind it.
         nearest = 1.0 - 0.5 * min(space.near / depth, 1.0)
         return Orbit(opening, target, torch.tensor([0.0, 1.0, 0.0]), (-turn, turn), (-turn, turn), (nearest, 1.3))
     up = torch.tensor([0.0, 0.0, 1.0])  # nerfstudio's worlds stand upright
@@ -114,23 +105,19 @@ def turned(orbit: Orbit, cameras: Cameras, yaw: float, pitch: float) -> Cameras:
 
 
 def rotation(axis: Float[Tensor, "3"], degrees: float) -> Float[Tensor, "3 3"]:
-    """Rotation about a unit vector by the right-hand rule (Rodrigues)."""
+    """Rotation about a unit vector by the right-hand rule."""
     x, y, z = axis.tolist()
     cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    angle = math.radians(degrees)
-    return torch.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+    return torch.matrix_exp(math.radians(degrees) * cross)
 
 
 def survey(orbit: Orbit, cameras: Cameras) -> List[Cameras]:
-    """Small cameras that between them see what the page may show: the training views, and turns of the opening one."""
+    """Small cameras that between them see what the page may show: the training views, and turns of the opening one.
+
+    The turns are at most 30 degrees apart, and at least three each way.
+    """
     views = [cameras[index : index + 1] for index in range(len(cameras))]
-    views += [turned(orbit, cameras, yaw, pitch) for yaw, pitch in _directions(orbit)]
-    return [resized(view, SURVEY_SIDE) for view in views]
-
-
-def _directions(orbit: Orbit) -> Iterator[Tuple[float, float]]:
-    """(yaw, pitch) at most 30 degrees apart, and at least three of each."""
-    counts = [max(3, math.ceil((high - low) / 30.0) + 1) for low, high in (orbit.yaw, orbit.pitch)]
-    for yaw in torch.linspace(*orbit.yaw, counts[0]).tolist():
-        for pitch in torch.linspace(*orbit.pitch, counts[1]).tolist():
-            yield yaw, pitch
+    ranges = orbit.yaw, orbit.pitch
+    angles = [torch.linspace(low, high, max(3, math.ceil((high - low) / 30.0) + 1)) for low, high in ranges]
+    views += [turned(orbit, cameras, yaw, pitch) for yaw, pitch in torch.cartesian_prod(*angles).tolist()]
+    return [pinholes(view, SURVEY_SIDE) for view in views]

@@ -1,6 +1,6 @@
 """Coloured points on the surfaces that a scene's training views see, and how well they stand for the scene."""
 
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
@@ -8,19 +8,21 @@ import torch
 from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
+from torch.nn import functional as F
 
+from sparsestyle_ns.evaluation.held_out import MIN_ACCUMULATION
+from sparsestyle_ns.export.stylised_scene import StylisedScene, exact_pictures
 from sparsestyle_ns.rendering.render import straight_color
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import write_output
 
-MIN_ACCUMULATION = 0.5
-"""Rays with less weight than this see no surface."""
 MAX_JUMP = 0.1
 """Share by which depth may differ between neighbouring pixels on one surface."""
 MAX_DEPTH = 10.0
 """What is farther away than this many times the median depth is background, not shape."""
 
 
-@dataclass
-class Points:
+class Points(NamedTuple):
     """Surface points in the coordinates of nerfstudio's cameras.
 
     Attributes:
@@ -32,6 +34,35 @@ class Points:
     positions: Float[Tensor, "points 3"]
     colors: Float[Tensor, "points 3"]
     origins: Float[Tensor, "points 3"]
+
+
+def export_points(scene: StylisedScene, output_path: Path) -> None:
+    """Writes the training views' surface points as PLY, and prints how well those of the others show each view.
+
+    Raises:
+        InputError: there is no surface point, or the file can't be written.
+    """
+    pictures, parts = surfaces(scene)
+    points = joined(parts)
+    if len(points.positions) == 0:
+        raise InputError(
+            "The views show no surface point, so there is nothing to write; train the coarse field longer."
+        )
+    write_output(output_path, encode_ply(points), "The points", "scene.ply")
+    print(f"{len(points.positions):,} points, in nerfstudio's coordinates")
+    if len(parts) > 1:
+        print("Each view as the points of all others show it, one pixel each, against the exact render:")
+        print_likeness(scene.names, cross_likeness(parts, scene.cameras, pictures))
+
+
+def surfaces(scene: StylisedScene) -> Tuple[List[Dict[str, Tensor]], List[Points]]:
+    """Full renders of the training views, with the colours of surfaces alone, and the points that each sees."""
+    background = scene.model.background
+    background = None if background is None else background.cpu()
+    pictures = exact_pictures(scene)
+    for picture in pictures:
+        picture["rgb"] = straight_color(picture["rgb"], picture["accumulation"], background)
+    return pictures, [surface_points(scene.cameras[i : i + 1], picture) for i, picture in enumerate(pictures)]
 
 
 def surface_points(camera: Cameras, picture: Dict[str, Tensor]) -> Points:
@@ -53,38 +84,27 @@ def surface_points(camera: Cameras, picture: Dict[str, Tensor]) -> Points:
     return Points(origins + depth[solid] * bundle.directions[solid], picture["rgb"][solid], origins)
 
 
-def without_background(picture: Dict[str, Tensor], background: Optional[Float[Tensor, "3"]]) -> Dict[str, Tensor]:
-    """A render with the colours of its surfaces alone, where pixels also show some background between them."""
-    return {**picture, "rgb": straight_color(picture["rgb"], picture["accumulation"], background)}
-
-
 def at_edge(depth: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
     """Pixels whose depth differs from that of one of the four neighbours by more than `MAX_JUMP`."""
-    edge = torch.zeros_like(depth, dtype=torch.bool)
-    for axis in (0, 1):
-        size = depth.shape[axis] - 1
-        first, second = depth.narrow(axis, 0, size), depth.narrow(axis, 1, size)
-        jump = (first - second).abs() > MAX_JUMP * torch.minimum(first, second)
-        edge.narrow(axis, 0, size).logical_or_(jump)
-        edge.narrow(axis, 1, size).logical_or_(jump)
-    return edge
+    padded = F.pad(depth[None], (1, 1, 1, 1), mode="replicate")[0]
+    neighbours = torch.stack([padded[1:-1, :-2], padded[1:-1, 2:], padded[:-2, 1:-1], padded[2:, 1:-1]])
+    return ((neighbours - depth).abs() > MAX_JUMP * torch.minimum(neighbours, depth)).any(dim=0)
 
 
 def joined(parts: Sequence[Points]) -> Points:
     """All points of several clouds."""
-    return Points(*(torch.cat([getattr(part, name) for part in parts]) for name in ("positions", "colors", "origins")))
+    return Points(*map(torch.cat, zip(*parts, strict=True)))
 
 
 def encode_ply(points: Points) -> bytes:
     """A binary PLY file: x, y, z as floats, red, green, blue as bytes."""
-    names = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    rows = np.empty(len(points.positions), dtype=names)
-    for column, (name, _) in enumerate(names[:3]):
-        rows[name] = points.positions[:, column].numpy()
-    for column, (name, _) in enumerate(names[3:]):
-        rows[name] = (255.0 * points.colors[:, column]).round().byte().numpy()
-    properties = "".join(f"property {'float' if kind == '<f4' else 'uchar'} {name}\n" for name, kind in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    rows = np.empty(len(points.positions), dtype=[("position", "<f4", 3), ("color", "u1", 3)])
+    rows["position"] = points.positions.numpy()
+    rows["color"] = (255.0 * points.colors).round().byte().numpy()
+    properties = [f"property float {name}" for name in "xyz"]
+    properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties, "end_header", ""]
+    header = "\n".join(lines)
     return header.encode("ascii") + rows.tobytes()
 
 
@@ -133,3 +153,12 @@ def cross_likeness(parts: List[Points], cameras: Cameras, pictures: List[Dict[st
         likeness(*splat(joined(parts[:index] + parts[index + 1 :]), cameras[index : index + 1]), picture)
         for index, picture in enumerate(pictures)
     ]
+
+
+def print_likeness(names: List[str], found: List[Likeness]) -> None:
+    """A line for each view."""
+    for name, (covered, value) in zip(names, found, strict=True):
+        if value is None:
+            print(f"  {name}: none of its surfaces is covered, so there is no PSNR")
+        else:
+            print(f"  {name}: {100 * covered:.0f}% of its surfaces covered, PSNR there {value:.1f} dB")

@@ -1,8 +1,8 @@
-"""Films of a stylised scene: a flight between its photos, or a turn about it."""
+"""Films of a stylised scene: one that is there already, a flight between its photos, or a turn about it."""
 
 import tempfile
 from pathlib import Path
-from typing import List, Optional, Sequence
+from typing import Optional, Sequence
 
 import imageio.v3 as iio
 import numpy as np
@@ -12,14 +12,30 @@ from nerfstudio.cameras.cameras import Cameras
 
 from sparsestyle_ns.core.camera_geometry import is_forward_facing
 from sparsestyle_ns.core.camera_paths import showing_path
-from sparsestyle_ns.gallery.page import Film
+from sparsestyle_ns.gallery.layout import Film
 from sparsestyle_ns.models.hier_style import HierStyleModel
+from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.page import Pixels
 from sparsestyle_ns.utils.progress import track
 
 FRAMES_PER_SECOND = 16
 CONSTANT_RATE_FACTOR = 20
 """x264's measure of quality: 18 can't be told from the original, 23 is its default."""
+
+
+def read_film(path: Path) -> Film:
+    """A film from an MP4 file.
+
+    Raises:
+        InputError: it can't be read or is no MP4.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"The video {path} can't be read ({error.strerror}).") from error
+    if content[4:8] != b"ftyp":
+        raise InputError(f"{path} is no MP4 video; give one that ns-render wrote.")
+    return Film(content, "A flight through the stylised scene.")
 
 
 @torch.no_grad()
@@ -38,7 +54,8 @@ def make_film(model: HierStyleModel, cameras: Cameras, frames: int, longest_side
         return None
     path = showing_path(cameras, frames)
     path.rescale_output_resolution(min(1.0, longest_side / int(max(path.width.max(), path.height.max()))))
-    path.width, path.height = path.width - path.width % 2, path.height - path.height % 2  # H.264 has half the colours
+    # H.264 keeps one colour for two by two pixels, so sides have to be even.
+    path.width, path.height = path.width - path.width % 2, path.height - path.height % 2
     pictures = []
     with model.rendering("baked"):
         for index in track(range(frames), "Filming"):
@@ -46,7 +63,7 @@ def make_film(model: HierStyleModel, cameras: Cameras, frames: int, longest_side
             pictures.append(as_pixels(outputs["rgb"].cpu().numpy()))
     flies = is_forward_facing(cameras.camera_to_worlds.cpu().float())
     what = "A flight through the photos' viewpoints" if flies else "A turn about the scene"
-    return Film(encode_mp4(pictures), f"{what}; baked renders.")
+    return Film(encode_mp4(pictures), f"{what}, in baked renders.")
 
 
 def encode_mp4(pictures: Sequence[Pixels]) -> bytes:
@@ -55,7 +72,7 @@ def encode_mp4(pictures: Sequence[Pixels]) -> bytes:
     Args:
         pictures: of one size, with even sides.
     """
-    options: List[str] = ["-crf", str(CONSTANT_RATE_FACTOR), "-preset", "slow", "-movflags", "+faststart"]
+    options = ["-crf", str(CONSTANT_RATE_FACTOR), "-preset", "slow", "-movflags", "+faststart"]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         settings = {"fps": FRAMES_PER_SECOND, "codec": "libx264", "macro_block_size": 2, "output_params": options}

@@ -1,4 +1,7 @@
-"""What HTML pages of this package have in common: one file that needs nothing else, light or dark."""
+"""HTML pages of this package: one file that needs nothing else, light or dark, made from Jinja2 templates.
+
+`templates/base.html` has what all pages share, `templates/macros.html` pictures and tables.
+"""
 
 import base64
 import io
@@ -9,9 +12,10 @@ from typing import Collection, Optional, Sequence
 
 import numpy as np
 from jaxtyping import UInt8
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
-from sparsestyle_ns.utils.output_file import prepare_output, write_output
+from sparsestyle_ns.utils.files import prepare_output, write_output
 
 Pixels = UInt8[np.ndarray, "H W 3"]
 
@@ -20,106 +24,44 @@ LOSSLESS_PIXELS = 200_000
 EXAMPLE_NAME = "index.html"
 """A good name for a page."""
 
-CONTENT_POLICY = (
-    "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
-)
-"""Keeps the page to what it carries, whatever is written into it."""
 
-BASE_STYLE = """
-:root {
-  --paper: #faf9f6; --card: #ffffff; --ink: #1d1c1a; --soft: #6c6a65; --line: #e4e1da; --accent: #b4492b;
-  --serif: "Iowan Old Style", "Palatino Linotype", Palatino, "Book Antiqua", Georgia, serif;
-  --sans: system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif;
-}
-@media (prefers-color-scheme: dark) {
-  :root {
-    --paper: #131314; --card: #1c1c1e; --ink: #f0eeea; --soft: #9b9892; --line: #2f2f32; --accent: #ef8e68;
-  }
-}
-* { box-sizing: border-box; margin: 0; }
-html { scroll-behavior: smooth; -webkit-text-size-adjust: 100%; }
-body {
-  background: var(--paper); color: var(--ink); font: 1rem/1.5 var(--sans);
-  max-width: 82rem; margin: 0 auto; padding: clamp(1.25rem, 4vw, 4rem) clamp(1rem, 4vw, 3.5rem) 4rem;
-}
-h1, h2 { font-family: var(--serif); font-weight: 500; line-height: 1.1; letter-spacing: -0.015em; text-wrap: balance; }
-h1 { font-size: clamp(2.1rem, 6vw, 3.75rem); }
-h2 { font-size: clamp(1.5rem, 3.4vw, 2.1rem); }
-h3 { font-size: 0.8125rem; font-weight: 600; letter-spacing: 0.04em; color: var(--accent); margin-bottom: 0.75rem; }
-h4 { font-size: 0.8125rem; font-weight: 500; color: var(--soft); margin-bottom: 0.5rem; }
-.top { margin-bottom: clamp(2rem, 5vw, 3.5rem); }
-nav { display: flex; flex-wrap: wrap; gap: 0.5rem 1.5rem; margin-top: 1rem; }
-a { color: var(--ink); text-decoration-color: var(--accent); text-underline-offset: 0.25em; }
-"""
-"""Colours, type and the room around."""
+def render_page(template: str, package: str, **values: object) -> str:
+    """A whole page from a Jinja2 template that extends `base.html` and may use the macros of `macros.html`.
 
-
-def html_page(title: str, style: str, body: str) -> str:
-    """A whole page.
+    Everything that is put into a template is escaped. Filters for what lies inside a page: `pixels | data_uri` and
+    `content | bytes_uri("video/mp4")`. A template takes its style sheets and scripts from files, by `include`.
 
     Args:
-        title: plain text.
-        style: rules beside `BASE_STYLE`.
-        body: HTML.
+        template: file name, in the folder `templates` of the package.
+        package: full name of a package, such as `sparsestyle_ns.gallery`.
+        values: what the template is filled with; it is an error to use a name that isn't there.
     """
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{CONTENT_POLICY}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="color-scheme" content="light dark">\n<link rel="icon" href="data:,">\n'
-        f"<title>{escape(title)}</title>\n<style>{BASE_STYLE}{style}</style>\n</head>\n<body>\n"
-        f"{body}\n</body>\n</html>\n"
+    environment = Environment(
+        loader=ChoiceLoader([PackageLoader(package), PackageLoader("sparsestyle_ns.utils")]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-
-
-def picture_page(title: str, contents: str, sections: str, style: str = "", script: str = "") -> str:
-    """A whole page of sections with pictures and tables.
-
-    Args:
-        title: its heading, plain text.
-        contents: HTML below the heading.
-        sections: HTML of its body.
-        style: rules beside those of pictures and tables.
-        script: what it does.
-    """
-    body = f'<header class="top"><h1>{escape(title)}</h1>{contents}</header>\n<main>\n{sections}</main>' + (
-        f"\n<script>{script}</script>" if script else ""
-    )
-    shared = (files("sparsestyle_ns.utils") / "page.css").read_text(encoding="utf-8")
-    return html_page(title, shared + style, body)
-
-
-def image(pixels: Pixels, alternative: str, name: str = "") -> str:
-    """A picture as HTML, of a class `name` if there is one; the alternative text is plain."""
-    height, width = pixels.shape[:2]
-    names = f' class="{name}"' if name else ""
-    return f'<img{names} src="{data_uri(pixels)}" width="{width}" height="{height}" alt="{escape(alternative)}">'
-
-
-def figure(pixels: Pixels, caption: str, alternative: Optional[str] = None) -> str:
-    """A picture with its caption, as HTML; both texts are plain."""
-    return f"<figure>{image(pixels, alternative or caption)}<figcaption>{escape(caption)}</figcaption></figure>"
+    environment.filters.update(data_uri=data_uri, bytes_uri=bytes_uri)
+    return environment.get_template(template).render(**values)
 
 
 def data_uri(pixels: Pixels) -> str:
     """A picture as a data URI: PNG, or JPEG where PNG would be heavy."""
-    lossless = pixels.shape[0] * pixels.shape[1] <= LOSSLESS_PIXELS
+    form = "png" if pixels.shape[0] * pixels.shape[1] <= LOSSLESS_PIXELS else "jpeg"
     buffer = io.BytesIO()
-    if lossless:
-        Image.fromarray(pixels).save(buffer, "PNG", optimize=True)
-    else:
-        Image.fromarray(pixels).save(buffer, "JPEG", quality=90)
-    return f"data:image/{'png' if lossless else 'jpeg'};base64,{base64.b64encode(buffer.getvalue()).decode()}"
+    Image.fromarray(pixels).save(buffer, form, optimize=True, quality=90)  # each takes the option that it knows
+    return bytes_uri(buffer.getvalue(), f"image/{form}")
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]], cited: Collection[str] = ()) -> str:
-    """A table of plain texts as HTML; rows whose first cell is in `cited` are marked as others' figures."""
-    heads = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
-    body = ""
-    for row in rows:
-        mark = " class=cited" if row[0] in cited else ""
-        body += f"<tr{mark}>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>"
-    return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table></div>'
+def bytes_uri(content: bytes, media_type: str) -> str:
+    """A file's bytes as a data URI.
+
+    Args:
+        media_type: what they are: video/mp4, image/svg+xml.
+    """
+    return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
 
 
 def prepare_page(output_path: Path) -> None:
@@ -145,3 +87,70 @@ def write_page(page: str, output_path: Path) -> Path:
         InputError: it can't be written there.
     """
     return write_output(output_path, page.encode(), "The page", EXAMPLE_NAME)
+
+
+# Pages in strings, until the studies' pages are templates too.
+
+CONTENT_POLICY = (
+    "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+)
+
+
+def html_page(title: str, style: str, body: str) -> str:
+    """A whole page.
+
+    Args:
+        title: plain text.
+        style: rules beside the shared ones.
+        body: HTML.
+    """
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{CONTENT_POLICY}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="color-scheme" content="light dark">\n<link rel="icon" href="data:,">\n'
+        f"<title>{escape(title)}</title>\n<style>{_shared_style()}{style}</style>\n</head>\n<body>\n"
+        f"{body}\n</body>\n</html>\n"
+    )
+
+
+def picture_page(title: str, contents: str, sections: str, style: str = "", script: str = "") -> str:
+    """A whole page of sections with pictures and tables.
+
+    Args:
+        title: its heading, plain text.
+        contents: HTML below the heading.
+        sections: HTML of its body.
+        style: rules beside those of pictures and tables.
+        script: what it does.
+    """
+    body = f'<header class="top"><h1>{escape(title)}</h1>{contents}</header>\n<main>\n{sections}</main>' + (
+        f"\n<script>{script}</script>" if script else ""
+    )
+    return html_page(title, style, body)
+
+
+def _shared_style() -> str:
+    return (files("sparsestyle_ns.utils") / "templates" / "base.css").read_text(encoding="utf-8")
+
+
+def image(pixels: Pixels, alternative: str, name: str = "") -> str:
+    """A picture as HTML, of a class `name` if there is one; the alternative text is plain."""
+    height, width = pixels.shape[:2]
+    names = f' class="{name}"' if name else ""
+    return f'<img{names} src="{data_uri(pixels)}" width="{width}" height="{height}" alt="{escape(alternative)}">'
+
+
+def figure(pixels: Pixels, caption: str, alternative: Optional[str] = None) -> str:
+    """A picture with its caption, as HTML; both texts are plain."""
+    return f"<figure>{image(pixels, alternative or caption)}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]], cited: Collection[str] = ()) -> str:
+    """A table of plain texts as HTML; rows whose first cell is in `cited` are marked as others' figures."""
+    heads = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
+    body = ""
+    for row in rows:
+        mark = " class=cited" if row[0] in cited else ""
+        body += f"<tr{mark}>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>"
+    return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table></div>'

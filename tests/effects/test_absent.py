@@ -267,4 +267,4 @@ def test_what_is_off_builds_nothing_and_reads_no_photo():
     assert background_color(decisions) is None
     assert build_exposure(decisions, num_photos=3) is None
     assert matched_rays(decisions, unread) is None
-    assert CoarseFieldConfig(**FIELD).setup(decisions).direction_encoding is None
+    assert CoarseFieldConfig(**FIELD).setup(decisions.on("view_color")).direction_encoding is None

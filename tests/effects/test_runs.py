@@ -14,7 +14,7 @@ from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.exposure import ExposureCorrection
 from sparsestyle_ns.effects.registry import EFFECTS, decided_on_photos
 from sparsestyle_ns.engine.loading import load_run
-from sparsestyle_ns.gallery.page import RunPictures, gallery_page
+from sparsestyle_ns.gallery.layout import RunPictures, gallery_page
 from sparsestyle_ns.pipelines import base as pipelines
 from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 from sparsestyle_ns.runs.run_folder import find_config
@@ -130,10 +130,10 @@ def test_the_page_has_a_line_for_every_effect() -> None:
 def view():
     import numpy as np
 
-    from sparsestyle_ns.gallery.page import View
+    from sparsestyle_ns.gallery.layout import View
 
     picture = np.zeros((4, 4, 3), np.uint8)
-    return View("view", picture, picture)
+    return View("view", picture, picture, picture, picture)
 
 
 def test_the_viewer_lists_every_effect() -> None:

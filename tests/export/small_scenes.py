@@ -9,7 +9,7 @@ from nerfstudio.data.scene_box import SceneBox
 
 from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace
 from sparsestyle_ns.export.orbit import Orbit, make_orbit
-from sparsestyle_ns.export.voxels import EMPTY, Voxels
+from sparsestyle_ns.export.voxel_grid import EMPTY, VoxelGrid
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 NUM_STEPS = 48
@@ -32,7 +32,7 @@ def look_ahead(*places) -> Cameras:
     return Cameras(poses, fx=FOCAL, fy=FOCAL, cx=32.0, cy=24.0, width=WIDTH, height=HEIGHT)
 
 
-def balls(resolution: int, cells: int) -> Voxels:
+def balls(resolution: int, cells: int) -> VoxelGrid:
     """Two coloured balls, soft at the edge, in a thin fog; cells away from them are empty."""
 
     def distances(points):
@@ -51,7 +51,7 @@ def balls(resolution: int, cells: int) -> Voxels:
     occupied = distances(at).amin(dim=-1) < 0.6
     known = (distances(points).amin(dim=-1) < 0.9) | (points.abs().amax(dim=-1) > 0.9)
     codes[~known] = torch.tensor([EMPTY, 0, 0, 0], dtype=torch.uint8)
-    return Voxels(codes, known, occupied)
+    return VoxelGrid(codes, known, occupied)
 
 
 def scene(kind: str) -> SimpleNamespace:
@@ -77,7 +77,7 @@ def scene(kind: str) -> SimpleNamespace:
     return SimpleNamespace(model=model, voxels=voxels, cameras=cameras, names=names, orbit=orbit)
 
 
-def put_walls(voxels: Voxels) -> None:
+def put_walls(voxels: VoxelGrid) -> None:
     """Coloured walls far away, where the contraction bends rays."""
     axis = torch.linspace(-1.0, 1.0, len(voxels.codes))
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)

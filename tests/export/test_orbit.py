@@ -6,7 +6,7 @@ import pytest
 import torch
 from small_scenes import KINDS, WIDTH, look_from, scene
 
-from sparsestyle_ns.export.orbit import most_central, resized, rotation, survey, turned
+from sparsestyle_ns.export.orbit import most_central, pinholes, rotation, survey, turned
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -62,8 +62,8 @@ def test_a_survey_has_all_photos_and_turns_in_all_directions():
 
 def test_cameras_are_only_made_smaller():
     small = scene("box")
-    assert int(resized(small.cameras[:1], 32).width) == 32
-    assert int(resized(small.cameras[:1], 500).width) == int(small.cameras.width[0]) == WIDTH
+    assert int(pinholes(small.cameras[:1], 32).width) == 32
+    assert int(pinholes(small.cameras[:1], 500).width) == int(small.cameras.width[0]) == WIDTH
 
 
 def test_rotation_is_right_handed():

@@ -1,6 +1,7 @@
 """Points and meshes lie on what the cameras see, with its colours, and files say so to other programs."""
 
 import re
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,18 +12,19 @@ from nerfstudio.cameras.cameras import Cameras
 from plyfile import PlyData
 
 from sparsestyle_ns.cli import main
-from sparsestyle_ns.export import command
+from sparsestyle_ns.export import points as points_module
 from sparsestyle_ns.export.mesh import picture_of_mesh, poisson_mesh
 from sparsestyle_ns.export.points import (
     Points,
     at_edge,
     cross_likeness,
     encode_ply,
+    export_points,
     joined,
     likeness,
     splat,
     surface_points,
-    without_background,
+    surfaces,
 )
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.rendering.render import over_background
@@ -86,12 +88,15 @@ def test_far_background_and_what_is_hardly_there_make_no_points():
     assert len(surface_points(camera, picture).positions) == 0
 
 
-def test_the_background_is_taken_off_colours():
-    color, background = torch.tensor([0.2, 0.4, 0.6]), torch.tensor([1.0, 1.0, 1.0])
-    accumulation = torch.tensor([[[0.8], [0.0], [1.0]]])
-    picture = {"rgb": accumulation * color + (1 - accumulation) * background, "accumulation": accumulation}
-    rgb = without_background(picture, background)["rgb"]
-    torch.testing.assert_close(rgb[0], torch.stack([color, torch.zeros(3), color]))
+def test_the_background_is_taken_off_colours(ball, monkeypatch):
+    picture, points = ball[0][0], ball[1][0]
+    accumulation, background = 0.8 * picture["accumulation"], torch.tensor([1.0, 1.0, 1.0])
+    rgb = over_background(accumulation * picture["rgb"], accumulation, background)
+    seen = {**picture, "accumulation": accumulation, "rgb": rgb}
+    monkeypatch.setattr(points_module, "exact_pictures", lambda scene: [seen])
+    pictures, parts = surfaces(SimpleNamespace(model=SimpleNamespace(background=background), cameras=cameras()))
+    torch.testing.assert_close(pictures[0]["rgb"], picture["rgb"])
+    torch.testing.assert_close(parts[0].colors, points.colors)
 
 
 def test_a_view_is_like_what_the_points_of_the_others_show(ball):
@@ -132,9 +137,9 @@ def test_where_no_surface_is_covered_there_is_no_psnr(ball, capsys):
 def test_an_export_says_in_words_that_a_view_is_not_covered(ball, tmp_path, capsys, monkeypatch):
     pictures, parts = ball
     unseen = Points(*torch.empty(3, 0, 3))
-    monkeypatch.setattr(command, "_surfaces", lambda scene: (pictures, [parts[0], unseen, unseen]))
+    monkeypatch.setattr(points_module, "surfaces", lambda scene: (pictures, [parts[0], unseen, unseen]))
     scene = SimpleNamespace(cameras=cameras(), names=["a.png", "b.png", "c.png"])
-    command.export_points(scene, tmp_path / "points.ply")
+    export_points(scene, tmp_path / "points.ply")
     printed = capsys.readouterr().out
     assert "a.png: none of its surfaces is covered, so there is no PSNR\n" in printed
     assert len(re.findall(r"% of its surfaces covered, PSNR there [\d.]+ dB", printed)) == 2
@@ -143,9 +148,9 @@ def test_an_export_says_in_words_that_a_view_is_not_covered(ball, tmp_path, caps
 
 def test_no_points_make_no_file(ball, tmp_path, monkeypatch):
     unseen = Points(*torch.empty(3, 0, 3))
-    monkeypatch.setattr(command, "_surfaces", lambda scene: (ball[0], [unseen] * 3))
+    monkeypatch.setattr(points_module, "surfaces", lambda scene: (ball[0], [unseen] * 3))
     with pytest.raises(InputError, match="The views show no surface point, so there is nothing to write"):
-        command.export_points(SimpleNamespace(cameras=cameras(), names=["a", "b", "c"]), tmp_path / "points.ply")
+        export_points(SimpleNamespace(cameras=cameras(), names=["a", "b", "c"]), tmp_path / "points.ply")
     assert not (tmp_path / "points.ply").exists()
 
 
@@ -172,6 +177,23 @@ def test_a_mesh_follows_the_surface_and_has_its_colours(ball):
 def test_too_few_points_make_no_mesh():
     with pytest.raises(InputError, match="only 5 surface points"):
         poisson_mesh(Points(*torch.rand(3, 5, 3)))
+
+
+def test_a_machine_on_which_open3d_can_not_be_loaded_is_told_what_to_install(tmp_path, monkeypatch):
+    (tmp_path / "config.yml").write_text("method_name: hier-style\n")
+    (tmp_path / "open3d.py").write_text(
+        "raise OSError('libusb-1.0.so.0: cannot open shared object file: No such file or directory')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "open3d")
+    monkeypatch.delitem(sys.modules, "sparsestyle_ns.export.mesh")
+    with pytest.raises(SystemExit) as ended:
+        main(["export", str(tmp_path), "--format", "mesh", "--output-path", str(tmp_path / "scene.ply")])
+    message = ended.value.code
+    assert message.startswith("Error: Open3D, which makes the mesh, can't be loaded (libusb-1.0.so.0: cannot open")
+    assert "apt-get install libusb-1.0-0" in message
+    assert "\n" not in message
+    assert not (tmp_path / "scene.ply").exists()
 
 
 @pytest.mark.parametrize("kind", ["ply", "mesh"])

@@ -7,7 +7,7 @@ from test_gallery_page import make_pixels, make_run
 
 from sparsestyle_ns.evaluation.tables import Table
 from sparsestyle_ns.gallery.film import encode_mp4
-from sparsestyle_ns.gallery.page import Film, View, gallery_page
+from sparsestyle_ns.gallery.layout import Film, View, gallery_page
 
 pytestmark = needs_chromium
 RED, BLUE = (200, 30, 20), (20, 40, 190)
@@ -25,7 +25,7 @@ def tab(tmp_path_factory):
     wide = Table("Consistency", ["a rather long heading of a column"] * 9, [("stylised", ["0.1234"] * 9)])
     effects = [("effect", "why"), ("ndc", "the cameras look one way, and depth has no end " * 3)]
     run = make_run(
-        views=[View("held-out view 0", plain(RED), plain(BLUE), plain((9, 9, 9)))],
+        views=[View("held-out view 0", plain(RED), plain(BLUE), plain((9, 9, 9)), plain((90, 90, 90)))],
         film=Film(encode_mp4(turning), "A turn"),
         tables=[wide],
         effects=effects,

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from sparsestyle_ns.evaluation.tables import Table
-from sparsestyle_ns.gallery.page import THUMBNAIL_SIDE, Film, Picture, RunPictures, View, gallery_page
+from sparsestyle_ns.gallery.layout import THUMBNAIL_SIDE, Film, Picture, RunPictures, View, gallery_page
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.page import data_uri, write_page
 
@@ -22,18 +22,18 @@ def make_pixels(seed, height=6, width=8):
 
 
 def make_run(**changes):
-    """A run with three photos and two views, the second of them without photo and depth."""
+    """A run with three photos and two views."""
     run = {
         "name": "fern",
         "subtitle": "hier-style, 3 photos, 200 iterations",
         "photos": [Picture(make_pixels(i), f"image00{i}.png") for i in range(3)],
         "views": [
-            View("held-out view 0", make_pixels(10), make_pixels(11), make_pixels(12), make_pixels(13)),
-            View("held-out view 8", make_pixels(14), make_pixels(15)),
+            View("held-out view 0", *map(make_pixels, range(10, 14))),
+            View("held-out view 8", *map(make_pixels, range(14, 18))),
         ],
         "style_name": "night",
         "style": Picture(make_pixels(20), "night.jpg"),
-        "figures": [("Coarse PSNR", "21.30 dB")],
+        "tables": [Table("Mean of the views above, 2", ["coarse PSNR dB ↑"], [("", ["21.30"])])],
         "settings": [("Method", "hier-style")],
     }
     return RunPictures(**{**run, **changes})
@@ -81,7 +81,7 @@ def test_page_holds_every_picture_and_the_film():
     sources = set(Page(gallery_page([run], "Stylised scenes")).values("src"))
     pictures = [photo.pixels for photo in run.photos] + [run.style.pixels]
     for view in run.views:
-        pictures += [view.stylised, view.coarse, *(p for p in (view.photo, view.depth) if p is not None)]
+        pictures += [view.stylised, view.coarse, view.photo, view.depth]
     expected = {data_uri(pixels) for pixels in pictures}
     assert sources == expected | {"data:video/mp4;base64," + base64.b64encode(MP4).decode()}
 
@@ -119,12 +119,12 @@ def test_names_are_text_never_markup():
         name=attack,
         subtitle=attack,
         photos=[Picture(make_pixels(0), attack)],
-        views=[View(attack, make_pixels(1), make_pixels(2))],
+        views=[View(attack, *map(make_pixels, range(1, 5)))],
         style_name=attack,
         style=None,
         style_note=attack,
         film=Film(MP4, attack),
-        figures=[(attack, attack)],
+        tables=[Table(attack, [attack], [(attack, [attack])], attack)],
         settings=[(attack, attack)],
     )
     html = gallery_page([run, run], attack)
@@ -137,10 +137,10 @@ def test_missing_style_image_is_noted():
     assert "The style image, night.jpg, is no longer there." in html
 
 
-def test_page_without_film_or_figures_has_no_empty_places_for_them():
-    html = gallery_page([make_run(figures=[])], "Scenes")
+def test_page_without_film_or_tables_has_no_empty_places_for_them():
+    html = gallery_page([make_run(tables=[])], "Scenes")
     assert "<video" not in html
-    assert "Measured" not in html
+    assert "<table" not in html
 
 
 def test_several_runs_get_a_contents_that_leads_to_them():
@@ -192,16 +192,14 @@ def test_one_run_has_no_grid():
 
 
 def test_the_grids_pictures_are_small():
-    large = View("view", make_pixels(1, 400, 500), make_pixels(2, 400, 500))
+    large = View("view", *(make_pixels(seed, 400, 500) for seed in range(4)))
     grid = grid_of([make_run(views=[large]), make_run(style_name="hat", views=[large])])[2]
-    assert max(map(int, re.findall(r'width="(\d+)"', grid))) == 500 // 3 <= THUMBNAIL_SIDE
+    assert max(map(int, re.findall(r'width="(\d+)"', grid))) == THUMBNAIL_SIDE
 
 
-def test_figures_of_all_held_out_views_take_the_place_of_those_of_the_views_that_are_shown():
+def test_figures_are_shown_in_tables_with_a_dash_for_those_that_are_missing():
     measured = Table("Style and content, 25 held-out views", ["NNFM <&>"], [("stylised", ["0.1"]), ("none", [None])])
-    html = gallery_page([make_run(tables=[measured])], "Scenes")
-    assert "21.30 dB" not in html
-    texts = Page(html).texts
+    texts = Page(gallery_page([make_run(tables=[measured])], "Scenes")).texts
     for text in ("Style and content, 25 held-out views", "NNFM <&>", "stylised", "0.1", "–"):
         assert text in texts
 

@@ -1,0 +1,36 @@
+"""What `sparsestyle export` is asked for. Nothing heavy is imported here, so that help and refusals come at once."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from sparsestyle_ns.runs.run_folder import STYLE_METHOD, find_config
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import prepare_output
+
+
+@dataclass
+class ExportOptions:
+    """The options of `sparsestyle export`."""
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run's folder or its config.yml."""
+    output_path: Path
+    """The file to write."""
+    format: Literal["html", "ply", "mesh"] = "html"
+    """What to write: a page, points or a mesh."""
+    resolution: int = 255
+    """html: cells along a side of the scene's cube. Every browser with WebGL2 can hold 255."""
+
+    def check(self) -> None:
+        """Makes sure that there is such a run, and that the file can be written.
+
+        Raises:
+            InputError: an option can't be used.
+        """
+        if not 32 <= self.resolution <= 1023:
+            raise InputError(f"--resolution {self.resolution} isn't between 32 and 1023; 255 suits most scenes.")
+        find_config(self.run, STYLE_METHOD)
+        prepare_output(self.output_path, "The scene", "scene.html" if self.format == "html" else "scene.ply")

@@ -1,0 +1,29 @@
+"""`sparsestyle export`: from a run to a file that needs no Python."""
+
+from sparsestyle_ns.engine.hints import after_export, finish
+from sparsestyle_ns.export.export_options import ExportOptions
+from sparsestyle_ns.export.points import export_points
+from sparsestyle_ns.export.stylised_scene import load_scene
+from sparsestyle_ns.export.web_page import export_page
+from sparsestyle_ns.runs.run_folder import find_config
+
+
+def export_run(options: ExportOptions) -> None:
+    """Writes the file, and prints how close it comes to the exact render.
+
+    Args:
+        options: checked.
+
+    Raises:
+        InputError: the run has no checkpoint, its scene can't be written so, or Open3D can't be loaded.
+    """
+    if options.format == "mesh":  # found out before the minutes of rendering; other formats work without Open3D
+        from sparsestyle_ns.export.mesh import export_mesh
+    scene = load_scene(find_config(options.run))
+    if options.format == "html":
+        export_page(scene, options.output_path, options.resolution)
+    elif options.format == "ply":
+        export_points(scene, options.output_path)
+    else:
+        export_mesh(scene, options.output_path)
+    finish(options.output_path.resolve(), after_export(options.run, options.output_path, options.format))

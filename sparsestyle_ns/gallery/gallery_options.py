@@ -1,0 +1,51 @@
+"""What `sparsestyle gallery` is asked for. Nothing heavy is imported here, so that help and refusals come at once."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Tuple
+
+import tyro
+
+from sparsestyle_ns.runs.run_folder import STYLE_METHOD, find_config
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.page import prepare_page
+
+
+@dataclass
+class GalleryOptions:
+    """The options of `sparsestyle gallery`."""
+
+    runs: Annotated[Tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
+    """Stylised runs to show, each by its folder or its config.yml."""
+    output_path: Path = Path("gallery.html")
+    """The page to write."""
+    video: Tuple[Path, ...] = ()
+    """MP4 files, as ns-render writes them, to show instead of films made here: one for each run, in the same order."""
+    title: str = "Stylised scenes"
+    """Heading of the page."""
+    num_views: int = 3
+    """Held-out views to render of each run."""
+    frames: int = 48
+    """Frames of the film, a flight between the photos' viewpoints or a turn about the scene, 16 a second; 0: none."""
+    evaluate: bool = False
+    """Measure runs that have no evaluation.json of their newest checkpoint, and save it in their folders."""
+
+    def check(self) -> None:
+        """Makes sure that there are such runs, and that the page can be written.
+
+        Raises:
+            InputError: an option can't be used.
+        """
+        if not self.runs:
+            raise InputError("There is no run to show; name at least one run's folder.")
+        if len(self.video) > len(self.runs):
+            raise InputError(
+                f"There are {len(self.video)} videos for {len(self.runs)} runs; give at most one for each run."
+            )
+        if self.num_views < 1:
+            raise InputError(f"--num-views is {self.num_views}; at least one view is needed.")
+        if self.frames < 0:
+            raise InputError(f"--frames is {self.frames}; give 0 for no film, or more.")
+        for run in self.runs:
+            find_config(run, STYLE_METHOD)
+        prepare_page(self.output_path)

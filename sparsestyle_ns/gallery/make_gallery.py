@@ -1,0 +1,199 @@
+"""`sparsestyle gallery`: what its page shows of runs is their files, renders, films, and what was measured of them."""
+
+import statistics
+from itertools import zip_longest
+from pathlib import Path
+from typing import Dict, List, Optional, Sequence, Tuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from nerfstudio.engine.trainer import TrainerConfig
+
+from sparsestyle_ns.data.photos import PhotoDataset, at_size
+from sparsestyle_ns.data.view_selection import evenly_spaced
+from sparsestyle_ns.engine.hints import finish
+from sparsestyle_ns.engine.loading import load_run
+from sparsestyle_ns.evaluation.held_out import SavedReport, by_figure, exact_outputs, saved_report
+from sparsestyle_ns.evaluation.tables import Table, report_tables, table_of
+from sparsestyle_ns.gallery.film import as_pixels, make_film, read_film
+from sparsestyle_ns.gallery.gallery_options import GalleryOptions
+from sparsestyle_ns.gallery.layout import Film, Picture, RunPictures, View, gallery_page, thumbnail
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
+from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config
+from sparsestyle_ns.style.painting import Painting
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.page import Pixels, write_page
+from sparsestyle_ns.utils.progress import say, track
+
+LONGEST_SIDE = 512
+"""Pixels that a picture on the page has at most along its longer side."""
+
+
+def make_gallery(options: GalleryOptions) -> None:
+    """Writes the page, and says where it is.
+
+    Args:
+        options: checked.
+
+    Raises:
+        InputError: a run or a video can't be used.
+    """
+    films = list(map(read_film, options.video))  # rendering takes minutes, so what can fail before does
+    runs = []
+    for run, film in zip_longest(options.runs, films):
+        say(f"Showing {run}")
+        runs.append(collect_run(run, film, options.num_views, options.frames, options.evaluate))
+    page = write_page(gallery_page(runs, options.title), options.output_path)
+    first = find_config(options.runs[0]).parent
+    finish(page, ["sparsestyle", "export", first, "--format", "html", "--output-path", "scene.html"])
+
+
+def collect_run(
+    run: Path, film: Optional[Film] = None, num_views: int = 3, frames: int = 48, evaluate: bool = False
+) -> RunPictures:
+    """Loads a stylised run, renders what the page shows of it, and finds out what was measured of it.
+
+    Args:
+        run: its folder or its config.yml. The run may have been moved since it was made.
+        film: what to show instead of a film that is made here.
+        num_views: held-out views to render, evenly spaced; fewer where there are fewer.
+        frames: of the film; 0 for none.
+        evaluate: whether to measure the run as `sparsestyle evaluate` does, where its folder has no report of its
+            newest checkpoint; the report is then saved there, if that can be. Without a report, the views that are
+            shown are measured.
+
+    Raises:
+        InputError: it isn't a finished run of this package, or its photos are gone.
+    """
+    config_path = find_config(run, STYLE_METHOD)
+    config, pipeline, step = load_run(config_path)
+    dataset = pipeline.datamanager.train_dataset
+    originals = _at_full_size(dataset)
+    photos = [Picture(_photo(originals, index), path.name) for index, path in enumerate(originals.image_filenames)]
+    views, measured = _render_views(pipeline, num_views)
+    if film is None and frames > 0:
+        film = make_film(pipeline.model, dataset.cameras, frames, LONGEST_SIDE)
+    report = saved_report(config_path.parent, step)
+    if report is None and evaluate:
+        report = _evaluate(config_path.parent, config, pipeline, step)
+    painting = config.pipeline.style_image
+    return RunPictures(
+        name=Path(config.experiment_name).name,
+        subtitle=f"{config.method_name}, {len(photos)} photos, {step + 1} iterations",
+        photos=photos,
+        views=views,
+        style_name="" if painting is None else painting.stem,
+        style=_style_picture(painting),
+        style_note=f"The style image, {painting}, is no longer there.",
+        film=film,
+        tables=[_views_table(measured)] if report is None else report_tables(report.means, report.num_views),
+        settings=_settings(config, dataset, step),
+        effects=pipeline.effects.rows(),
+    )
+
+
+def _evaluate(folder: Path, config: TrainerConfig, pipeline: HierStylePipeline, step: int) -> SavedReport:
+    """Measures a run on all held-out views, and saves the report in its folder, if that can be."""
+    report = pipeline.held_out_report()
+    try:
+        report.save(folder / REPORT_FILE, config.experiment_name, config.method_name, step)
+    except OSError as error:
+        say(f"{REPORT_FILE} can't be saved in {folder} ({error.strerror}); its figures are on the page.")
+    return SavedReport(report.means, len(report.views))
+
+
+def _render_views(pipeline: HierStylePipeline, num_views: int) -> Tuple[List[View], List[Dict[str, float]]]:
+    """Held-out views with their photos, and what the model measures of each."""
+    dataset = pipeline.datamanager.eval_dataset
+    trained = set(pipeline.datamanager.train_dataset.image_filenames)
+    originals = _at_full_size(dataset)
+    views, measured = [], []
+    for index in track(evenly_spaced(len(dataset), min(num_views, len(dataset))), "Views"):
+        path = dataset.image_filenames[index]
+        photo = _photo(originals, index)
+        height, width = photo.shape[:2]
+        camera = at_size(originals.cameras[index : index + 1], *torch.tensor([width, height]).view(2, 1, 1))
+        camera = camera.to(pipeline.device)
+        camera.distortion_params = dataset.cameras[index : index + 1].distortion_params
+        with torch.no_grad():
+            outputs = exact_outputs(pipeline.model, camera)
+            metrics, _ = pipeline.model.get_image_metrics_and_images(
+                outputs, {"image": torch.from_numpy(photo).to(pipeline.device) / 255.0}
+            )
+        measured.append(metrics)
+        arrays = {key: value.cpu().numpy() for key, value in outputs.items()}
+        views.append(
+            View(
+                name=f"{'Training view' if path in trained else 'Held-out view'} {path.name}",
+                stylised=as_pixels(arrays["rgb"]),
+                coarse=as_pixels(arrays["rgb_coarse"]),
+                photo=photo,
+                depth=depth_picture(arrays["depth"], arrays["accumulation"]),
+            )
+        )
+    return views, measured
+
+
+def depth_picture(depth: Float[np.ndarray, "H W 1"], accumulation: Float[np.ndarray, "H W 1"]) -> Pixels:
+    """Depth as shades, near light and far dark; where there is nothing, middle grey.
+
+    The shade is linear in 1 / depth, between the 2nd and the 98th percentile of what is seen, so that a far wall
+    doesn't take all shades from the things before it.
+    """
+    nearness = 1.0 / np.maximum(depth[..., 0], 1e-6)
+    weight = np.clip(accumulation, 0.0, 1.0)
+    seen = nearness[weight[..., 0] > 0.5]
+    far, near = np.percentile(seen, (2, 98)) if seen.size else (0.0, 1.0)
+    share = np.clip((nearness - far) / max(near - far, 1e-9), 0.0, 1.0)
+    shades = np.array([[0.10, 0.13, 0.22], [0.72, 0.38, 0.30], [0.98, 0.93, 0.82]])  # far, middle, near
+    shade = np.stack([np.interp(share, (0.0, 0.5, 1.0), channel) for channel in shades.T], axis=-1)
+    return as_pixels(shade * weight + 0.5 * (1.0 - weight))
+
+
+def _at_full_size(dataset: PhotoDataset) -> PhotoDataset:
+    """The same photos at the size of their files, where the run was trained on smaller ones."""
+    return PhotoDataset(dataset._dataparser_outputs)
+
+
+def _photo(dataset: PhotoDataset, index: int) -> Pixels:
+    return thumbnail(dataset.get_image_uint8(index)[..., :3].numpy(), LONGEST_SIDE)
+
+
+def _style_picture(path: Optional[Path]) -> Optional[Picture]:
+    """The painting, where its file is still there."""
+    if path is None:
+        return None
+    try:
+        image = Painting.read(path).pixels
+    except InputError:
+        return None
+    return Picture(thumbnail(as_pixels(image.permute(1, 2, 0).numpy()), LONGEST_SIDE), path.name)
+
+
+def _views_table(views: Sequence[Dict[str, float]]) -> Table:
+    """Means over the views that are shown of what the model measured of them."""
+    means = {key: statistics.fmean(values) for key, values in by_figure(views).items()}
+    columns = [(f"coarse_{key}", key, "coarse ") for key in ("psnr", "ssim", "lpips")]
+    columns.append(("content_ssim", "content_ssim", "stylised "))
+    return table_of(f"Mean of the views above, {len(views)}", columns, [("", means)])
+
+
+def _settings(config: TrainerConfig, dataset: PhotoDataset, step: int) -> List[Tuple[str, str]]:
+    pipeline = config.pipeline
+    height, width = int(dataset.cameras.height[0]), int(dataset.cameras.width[0])
+    first = pipeline.loss_weights["content"]
+    last = first * pipeline.content_decay
+    return [
+        ("Method", config.method_name),
+        ("Made", config.timestamp),
+        ("Views trained on", ", ".join(map(str, dataset.metadata["scene_info"].view_ids))),
+        ("Photo size in training", f"{width} × {height} pixels"),
+        ("Iterations", f"{step + 1} of {config.max_num_iterations}"),
+        ("Coarse run", "none" if pipeline.coarse_run is None else pipeline.coarse_run.name),
+        ("Style image", "none" if pipeline.style_image is None else pipeline.style_image.name),
+        ("Feature network", pipeline.backbone if pipeline.vgg_weights is None else pipeline.vgg_weights.name),
+        ("Size it sees views at", f"{pipeline.feature_side} pixels"),
+        ("Content weight λ", f"{first:g} to {last:g} in {pipeline.content_steps} iterations"),
+        ("Warm start", f"{pipeline.warm_start_steps} steps"),
+    ]

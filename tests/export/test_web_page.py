@@ -1,0 +1,220 @@
+"""The page carries the scene whole and nothing from elsewhere, and shows in a browser what its twin in torch says."""
+
+import base64
+import gzip
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+from chromium import needs_chromium, open_tab
+from conftest import run_entrypoint
+from PIL import Image
+from small_scenes import HEIGHT, KINDS, WIDTH, psnr, scene
+from torchvision.transforms.functional import to_tensor
+
+from sparsestyle_ns.cli import main
+from sparsestyle_ns.export.orbit import turned
+from sparsestyle_ns.export.voxel_grid import EMPTY, VoxelGrid, picture_of_voxels
+from sparsestyle_ns.export.web_page import build_page, fit_page
+from sparsestyle_ns.utils.errors import InputError
+
+READY = "document.body.dataset.state === 'ready'"
+SETTLED = "document.body.dataset.state !== 'moving'"
+
+
+def page_of(kind, title="A scene", names=None):
+    small = scene(kind)
+    small.title, small.names = title, names or small.names
+    return build_page(small.voxels, small, small.orbit)
+
+
+def unpack(page):
+    """What a page says of its scene, and the voxels that it carries, read as web_page.py describes them."""
+    text = page.decode()
+    told, packed = (
+        re.search(f'<script id="{name}"[^>]*>(.*?)</script>', text, re.DOTALL)[1] for name in ("scene", "voxels")
+    )
+    told = json.loads(told)
+    data = np.frombuffer(gzip.decompress(base64.b64decode(packed)), np.uint8)
+    sides = told["cells"], told["resolution"] + 1
+    occupied, known, planes = np.split(data, np.cumsum([-(-(side**3) // 8) for side in sides]))
+    occupied, known = (
+        torch.from_numpy(np.unpackbits(bits, count=side**3, bitorder="little").astype(bool)).view(side, side, side)
+        for bits, side in zip((occupied, known), sides, strict=True)
+    )
+    codes = torch.zeros(*known.shape, 4, dtype=torch.uint8)
+    codes[..., 0] = EMPTY
+    codes[known] = torch.from_numpy(np.cumsum(planes.reshape(4, -1), axis=1, dtype=np.uint8).T.copy())
+    return told, VoxelGrid(codes, known, occupied)
+
+
+def shown(tab):
+    """The canvas in the window's corner, as a picture in [0, 1]."""
+    return torch.from_numpy(tab.screenshot()[:HEIGHT, :WIDTH] / 255.0).float()
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory):
+    with open_tab(tmp_path_factory.mktemp("profile")) as tab:
+        yield tab
+
+
+def test_what_is_packed_is_unpacked():
+    small = scene("box")
+    told, voxels = unpack(page_of("box"))
+    assert told["resolution"] == voxels.resolution == 31
+    for name in ("codes", "known", "occupied"):
+        assert torch.equal(getattr(voxels, name), getattr(small.voxels, name)), name
+
+
+def test_the_same_scene_gives_the_same_file():
+    assert page_of("ndc") == page_of("ndc")
+
+
+def test_the_page_asks_nothing_of_a_network():
+    text = page_of("ndc").decode()
+    assert "default-src 'none'" in text
+    assert not re.search(r'https?://|\b(src|href)="(?!data:)|@import|fetch\(', text)
+
+
+def test_titles_and_file_names_are_text_never_markup():
+    attack = '</script><script>alert("1")</script>'
+    text = page_of("box", title=attack, names=[attack] * 3).decode()
+    assert attack not in text
+    assert unpack(text.encode())[0]["cameras"][0]["name"] == attack
+
+
+def test_a_page_that_is_too_large_gets_fewer_cells():
+    tried = []
+
+    def bake(resolution):
+        tried.append(resolution)
+        return resolution
+
+    voxels, page = fit_page(bake, lambda resolution: bytes(resolution**3), 100, max_bytes=600_000)
+    assert tried == [100, 82]  # the cube root of 0.95 · 0.6 is 0.829
+    assert voxels == 82
+    assert len(page) <= 600_000
+
+
+def test_a_scene_that_does_not_fit_is_refused():
+    with pytest.raises(InputError, match=r"doesn't fit into a page of 0 MB, even with 40 cells"):
+        fit_page(lambda resolution: resolution, lambda resolution: bytes(1000), 40, max_bytes=10)
+
+
+@needs_chromium
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_browser_shows_what_the_twin_in_torch_says(tab, tmp_path, kind):
+    small, path = scene(kind), tmp_path / "page.html"
+    path.write_bytes(page_of(kind))
+    for view in (0, 2):
+        tab.open(f"{path.as_uri()}#view={view}&size={WIDTH}x{HEIGHT}")
+        tab.wait_for(READY)
+        expected = picture_of_voxels(small.voxels, small.model, small.cameras[view : view + 1])
+        assert expected.std() > 0.05  # there is something to see
+        # A screen has 256 shades: rounding alone leaves 59 dB. Cells' borders are where float32 puts them.
+        assert psnr(shown(tab), expected) > 45
+
+
+@needs_chromium
+@pytest.mark.parametrize("kind", ["ndc", "box"])
+def test_dragging_turns_the_camera_as_the_orbit_says(tab, tmp_path, kind):
+    small, path = scene(kind), tmp_path / "page.html"
+    path.write_bytes(page_of(kind))
+    tab.open(f"{path.as_uri()}#size={WIDTH}x{HEIGHT}")
+    tab.wait_for(READY)
+    tab.mouse("mousePressed", 40, 24, button="left", clickCount=1)
+    tab.mouse("mouseMoved", 20, 30, button="left")
+    tab.mouse("mouseReleased", 20, 30, button="left")
+    tab.wait_for(READY)
+    degrees = 180 / 480
+    expected = picture_of_voxels(
+        small.voxels, small.model, turned(small.orbit, small.cameras, yaw=20 * degrees, pitch=6 * degrees)
+    )
+    before = picture_of_voxels(small.voxels, small.model, small.cameras[:1])
+    assert psnr(before, expected) < 30
+    assert psnr(shown(tab), expected) > 45
+
+
+def opened(tab, folder):
+    """The picture that the page of a scene in a box opens with."""
+    path = folder / "page.html"
+    path.write_bytes(page_of("box"))
+    tab.open(f"{path.as_uri()}#size={WIDTH}x{HEIGHT}")
+    tab.wait_for(READY)
+    return shown(tab)
+
+
+@needs_chromium
+def test_the_wheel_comes_nearer_keys_turn_and_the_button_goes_back_to_the_photos(tab, tmp_path):
+    opening = opened(tab, tmp_path)
+    background = torch.tensor([1.0, 0.9, 0.8])
+
+    def covered(picture):
+        return int(((picture - background).abs().amax(dim=-1) > 0.02).sum())
+
+    tab.mouse("mouseWheel", 30, 20, deltaX=0, deltaY=-400)
+    tab.wait_for("document.body.dataset.state === 'moving'")
+    tab.wait_for(READY)
+    near = shown(tab)
+    assert covered(near) > 1.2 * covered(opening)
+    tab.evaluate("canvas.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowLeft'}))")
+    tab.wait_for(READY)
+    assert psnr(shown(tab), near) < 35
+    tab.evaluate("document.getElementById('next').click()")
+    tab.wait_for(READY)
+    torch.testing.assert_close(shown(tab), opening)
+
+
+@needs_chromium
+def test_a_fine_picture_that_is_asked_for_while_a_coarse_one_is_due_is_drawn(tab, tmp_path):
+    opening = opened(tab, tmp_path)
+    # Both before the next frame, which a callback that is asked for after them comes at the end of.
+    state = tab.evaluate(
+        """new Promise((done) => {
+            canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowLeft" }));
+            document.getElementById("next").click();
+            requestAnimationFrame(() => done(document.body.dataset.state));
+        })"""
+    )
+    assert state == "ready"
+    torch.testing.assert_close(shown(tab), opening)
+
+
+@needs_chromium
+def test_without_webgl_the_page_says_what_to_do(tab, tmp_path):
+    path = tmp_path / "page.html"
+    path.write_bytes(page_of("box"))
+    script = tab.call(
+        "Page.addScriptToEvaluateOnNewDocument", source="HTMLCanvasElement.prototype.getContext = () => null;"
+    )
+    try:
+        tab.open(path.as_uri())
+        tab.wait_for("document.body.dataset.state === 'failed'")
+    finally:
+        tab.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script["identifier"])
+    assert "shows no WebGL2" in tab.evaluate("document.getElementById('message').textContent")
+
+
+@needs_chromium
+def test_an_exported_run_looks_in_a_browser_as_ns_render_shows_it(tab, patterned_run, tmp_path, capsys):
+    from nerfstudio.scripts import render
+
+    main(["export", str(patterned_run), "--output-path", str(tmp_path / "run.html"), "--resolution", "95"])
+    printed = capsys.readouterr().out
+    told = [float(value) for value in re.findall(r"view of \S+: ([\d.]+) dB", printed)]
+    flags = ["--split", "train", "--rendered-output-names", "rgb", "--image-format", "png"]
+    where = ["--load-config", str(patterned_run / "config.yml"), "--output-path", str(tmp_path)]
+    run_entrypoint(render.entrypoint, ["dataset", *where, *flags])
+    names = ("image001", "image005", "image011")
+    assert len(told) == len(names)
+    for view, name in enumerate(names):
+        tab.open(f"{(tmp_path / 'run.html').as_uri()}#view={view}&size=32x24")
+        tab.wait_for(READY)
+        picture = torch.from_numpy(tab.screenshot()[:24, :32] / 255.0).float()
+        expected = to_tensor(Image.open(tmp_path / "train" / "rgb" / f"{name}.png")).movedim(0, -1)
+        assert told[view] > 35
+        assert psnr(picture, expected) == pytest.approx(told[view], abs=1.0)
+        assert psnr(picture, expected.flip(1)) < 30  # the scene has a left and a right
