@@ -14,9 +14,10 @@ from clock import FakeClock
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
+from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.studies.options import TradeoffOptions
-from sparsestyle_ns.studies.study import Study, get_setting, parse_dataparser
+from sparsestyle_ns.studies.study import Study, get_setting
 from sparsestyle_ns.studies.tradeoff import measuring
 from sparsestyle_ns.studies.tradeoff.measure_training import StageRuns
 from sparsestyle_ns.studies.tradeoff.time_budget import Budget
