@@ -45,10 +45,10 @@ class CoarseFewShotModelConfig(ModelConfig):
     num_bins: int = 64
     """Bins of the histogram that samples follow where empty space is skipped."""
     thinning: float = 2.0
-    """Samples whose gradient is smaller than this many times the batch's mean take part in the backward pass with a
-    probability in proportion only, and count for more where they do; 0: all samples take part."""
+    """Spares the backward pass samples with small gradients: of those below this many times the batch's mean, some are
+    drawn, in proportion to their size, and count for more. 0 keeps all samples."""
     even_share: float = 0.4
-    """Share of those samples, in (0, 1], that is spread evenly."""
+    """Share of the samples, in (0, 1], that is spread evenly along a ray where empty space is skipped."""
     grid_resolution: int = 64
     """Cells along a side of the grid that remembers density."""
     distortion_weight: float = 0.015
