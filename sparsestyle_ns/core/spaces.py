@@ -73,7 +73,7 @@ class ForwardFacingSegments(LinearSegments):
     origins: Float[Tensor, "rays 3"]
     directions: Float[Tensor, "rays 3"]
     near: float
-    first: float
+    first: Float[Tensor, "rays 1"]
     last: float
 
     def distance(self, s: Tensor) -> Tensor:
@@ -247,14 +247,17 @@ class ForwardFacingSpace(Space):
         hit = valid.squeeze(-1)
         size = self.maximum - self.minimum
         scale = 2.0 / torch.where(size > 0, size, 2.0)
+        # A camera that has flown past the nearest thing doesn't see what is behind it.
+        own = ndc_parameter(torch.zeros_like(origins[:, :1]), origins, directions, self.near)
+        first = own.clamp(self.first, self.last)
         return ForwardFacingSegments(
-            start=(start + self.first * extent - self.minimum) * scale - 1.0,
-            extent=(self.last - self.first) * extent * scale * hit[:, None],
+            start=(start + first * extent - self.minimum) * scale - 1.0,
+            extent=(self.last - first) * extent * scale * hit[:, None],
             hit=hit,
             origins=origins,
             directions=directions,
             near=self.near,
-            first=self.first,
+            first=first,
             last=self.last,
         )
 

@@ -135,7 +135,7 @@ class Restyling:
     def __iter__(self) -> Iterator[Progress]:
         yield Progress(f"Looking at {self.image.name}")
         backbone = self.workshop.backbone()
-        targets = self.pipeline.config.targets_of(StyleInputs(self.image, backbone))
+        targets = self.pipeline.config.targets_of(StyleInputs(self.image, backbone), self.pipeline.device)
         self.effects = self._decide()
         if self.pipeline.scene_views is None:
             yield Progress("Preparing the views, which the next style won't need")
@@ -168,7 +168,7 @@ class Restyling:
 
         training_step(self.optimizers, compute_losses, step)
         advice = "try another image, or a lower learning rate in the run's config.yml."
-        check_skipped(self.optimizers, self.config.max_skipped_steps, advice)
+        check_skipped(self.optimizers, self.config.max_skipped_steps, "The restyling stopped", advice)
         return {name: float(value) for name, value in metrics.items()}
 
     def save(self) -> Path:
@@ -212,7 +212,7 @@ class Restyling:
         self.effects.save(new)
         step = self.iterations - 1
         path = checkpoint_path(new / self.config.relative_model_dir, step)
-        write_checkpoint(path, step, self._state(), self.optimizers, self._notes())
+        write_checkpoint(path, step, self._state(), self.optimizers, self.notes())
         return painting
 
     def _write_config(self, new: Path, folder: Path, painting: Path) -> None:
@@ -228,7 +228,8 @@ class Restyling:
         state = {name: value for name, value in self.pipeline.state_dict().items() if not name.startswith(RESIDUAL)}
         return {**state, **{RESIDUAL + name: value for name, value in self.field.state_dict().items()}}
 
-    def _notes(self) -> CheckpointNotes:
+    def notes(self) -> CheckpointNotes:
+        """What its checkpoint says beside the state."""
         settings = self.config.pipeline
         return CheckpointNotes(
             effects=self.effects.records(),

@@ -271,8 +271,8 @@ class SparseStyleTrainer(Trainer, ABC):
         kept = "No checkpoint was saved before."
         if self._kept_step is not None:
             kept = f"The checkpoint of iteration {self._kept_step + 1} is from before and stays."
-        advice = f"training stopped after iteration {step + 1}. Try a lower learning rate, {LEARNING_RATE_FLAG}. {kept}"
-        return check_skipped(self.optimizers, self.config.max_skipped_steps, advice)
+        stopped, advice = f"Training stopped after iteration {step + 1}", f"try a lower {LEARNING_RATE_FLAG}. {kept}"
+        return check_skipped(self.optimizers, self.config.max_skipped_steps, stopped, advice)
 
     def eval_iteration(self, step: int) -> None:
         """What nerfstudio evaluates after an iteration, and the preview after some; then it is over.

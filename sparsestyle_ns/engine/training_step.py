@@ -65,13 +65,13 @@ def warm_start(pipeline: HierStylePipeline, task: StyleTask, learning_rate: floa
     optimizers.zero_grad_all()
 
 
-def check_skipped(optimizers: FiniteOptimizers, most: int, advice: str) -> int:
+def check_skipped(optimizers: FiniteOptimizers, most: int, stopped: str, advice: str) -> int:
     """How many steps were skipped in a row up to now, because their gradients weren't finite; waits for a GPU.
 
     Raises:
-        InputError: so many that training can't go on; the sentence ends with `advice`.
+        InputError: so many that training can't go on; the sentence begins with `stopped` and ends with `advice`.
     """
     in_a_row = optimizers.skipped().in_a_row
     if in_a_row >= most:
-        raise InputError(f"The gradients of the last {in_a_row} iterations weren't finite; {advice}")
+        raise InputError(f"{stopped}, because the gradients of the last {in_a_row} weren't finite; {advice}")
     return in_a_row

@@ -18,13 +18,14 @@ from sparsestyle_ns.losses.stylization import Losses
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
 from sparsestyle_ns.rendering.look import RENDER_MODES, Look
 from sparsestyle_ns.rendering.mixing import Mix
+from sparsestyle_ns.runs.checkpoints import CheckpointNotes
 from sparsestyle_ns.runs.thumbnail import find_thumbnail
 from sparsestyle_ns.utils.names import free_name
 from sparsestyle_ns.viewer.adjustments import begin_at_central_photo, hide_frustums, keep_outputs
 from sparsestyle_ns.viewer.baking import Baker
 from sparsestyle_ns.viewer.effects_panel import add_effects
 from sparsestyle_ns.viewer.restyling_controls import Pace, RestylingControls
-from sparsestyle_ns.viewer.styles import Facts, Style, checkpoint_notes, style_facts
+from sparsestyle_ns.viewer.styles import Facts, Style, saved_notes, style_facts
 from sparsestyle_ns.viewer.texts import losses_text
 
 NO_BLEND = "nothing"
@@ -140,12 +141,13 @@ class StylePanel(ViewerControl):
     def describe_run(self) -> None:
         """Says what made the run's own style, as far as it is known by now."""
         painting, trainer = self.pipeline.config.style_image, self.viewer.trainer
+        notes, iterations = CheckpointNotes(), None
         if trainer is None:
-            notes = checkpoint_notes(self.folder / "nerfstudio_models")
-        else:
-            notes = trainer.notes() if self.pipeline.targets is not None else {}
+            notes, iterations = saved_notes(self.folder / "nerfstudio_models")
+        elif self.pipeline.targets is not None:
+            notes = trainer.notes()
         own = self.styles[0]
-        own.facts = style_facts(None if painting is None else painting.name, str(self.folder), notes)
+        own.facts = style_facts(None if painting is None else painting.name, str(self.folder), notes, iterations)
         own.thumbnail = find_thumbnail(self.folder, painting)
         self.description.content = self._chosen().markdown()
 
