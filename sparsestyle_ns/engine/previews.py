@@ -50,10 +50,15 @@ def render_preview(pipeline: CheckedPipeline, longest_side: int) -> Float[Tensor
     return torch.cat([photo, *renders], dim=1)
 
 
+def preview_path(run: Path, iterations: int) -> Path:
+    """Where the preview after so many iterations is, in a run's folder."""
+    return run / "previews" / f"after-{iterations:06d}.png"
+
+
 def save_preview(picture: Float[Tensor, "H W 3"], run: Path, iterations: int) -> None:
     """Writes a preview into the folder previews of a run; where that can't be done, says so."""
     image = Image.fromarray(to8b(picture).cpu().numpy())
     try:
-        write_whole(run / "previews" / f"after-{iterations:06d}.png", lambda file: image.save(file, "PNG"))
+        write_whole(preview_path(run, iterations), lambda file: image.save(file, "PNG"))
     except OSError as error:
         say(f"The preview after {iterations} iterations can't be saved ({error.strerror}); training goes on.")
