@@ -63,7 +63,6 @@ ELSEWHERE = {
     "sparsestyle_ns.core.schedules": "test_schedules.py and test_hard_schedules.py",
     "sparsestyle_ns.losses.stylization.default_weights": "takes no input: test_stylization.py",
     "sparsestyle_ns.losses.style_index.check_style": "refuses, and returns nothing: test_nnfm.py",
-    "sparsestyle_ns.style.backbone.check_tensor": "reads weight files: test_vgg.py",
     "sparsestyle_ns.style.backbones": "reads weight files: test_vgg.py",
     "sparsestyle_ns.field_components.tiny_cuda_grid.has_tiny_cuda_nn": "asks what is installed: test_hier_style.py",
     "sparsestyle_ns.rendering.baked.march_compiled": "is what render_baked calls on a CPU",
