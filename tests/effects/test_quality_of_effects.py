@@ -141,7 +141,7 @@ def test_an_effect_that_a_scene_calls_for_makes_held_out_views_better(scenes, la
     with_it, without = (held_out_psnr(folder, layout, 300, effects) for effects in (on, off))
     print(
         f"{layout} {options} {on}: {with_it:.2f} dB, {off}: {without:.2f} dB"
-    )  # the table of docs/effects.md, by pytest -rP
+    )  # docs/effects.md's table
     assert with_it > without
 
 
