@@ -4,16 +4,15 @@ A subcommand is a function here: its arguments and docstring are the command lin
 when it runs, so that help is there at once.
 """
 
-import shlex
 import sys
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Callable, Dict, List, Literal, Optional, Sequence, Tuple
+from typing import Annotated, Any, Callable, Dict, Literal, Optional, Sequence, Tuple
 
 import tyro
 
 from sparsestyle_ns.export.export_options import ExportOptions
 from sparsestyle_ns.gallery.gallery_options import GalleryOptions
+from sparsestyle_ns.studies.options import StudyOptions, TradeoffOptions
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 
 
@@ -77,7 +76,9 @@ def evaluate(
 @exit_on_input_error
 def effects(
     data: Path,
-    dataparser: Annotated[Tuple[str, ...], tyro.conf.Positional] = (),
+    dataparser: Annotated[
+        Tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[DATAPARSER [OPTION ...]]")
+    ] = (),
     json: bool = False,
     num_views: Optional[int] = None,
     view_ids: Optional[Tuple[int, ...]] = None,
@@ -113,100 +114,15 @@ def effects(
 
 
 @exit_on_input_error
-def tradeoff(
-    data: Path,
-    dataparser: Annotated[Tuple[str, ...], tyro.conf.Positional] = (),
-    style_image: Optional[Path] = None,
-    budget: str = "10m",
-    output_dir: Path = Path("tradeoff"),
-    coarse_run: Optional[Path] = None,
-    max_image_side: Optional[int] = None,
-    num_views: Optional[int] = None,
-    view_ids: Optional[Tuple[int, ...]] = None,
-    full: bool = False,
-    groups: Tuple[Literal["quadrature", "training", "fine-field", "style", "rendering", "precision"], ...] = (),
-    rounds: int = 3,
-    vgg_weights: Optional[Path] = None,
-    backbone: Literal["auto", "vgg16", "vgg16-shift-tolerant"] = "auto",
-) -> None:
+def tradeoff(options: Annotated[TradeoffOptions, tyro.conf.arg(name="")]) -> None:
     """Measures what accuracy costs in time, on this machine and a scene of yours.
 
     Writes curves of error against time for each setting that trades one for the other, as a page that opens offline,
     JSON and CSV, and says in plain words what to turn. Ctrl-C keeps what has been measured.
-
-    Args:
-        data: The scene, as for ns-train.
-        dataparser: How to read it, where its files don't tell: llff-data, blender-data, colmap …; its options come
-            after two dashes: -- llff-data --eval-interval 4.
-        style_image: The painting; without it, what stylises is left out.
-        budget: Time that it may take, such as 90s, 10m or 1h30m. More of it gives longer runs and more repetitions.
-        output_dir: Folder of the report.
-        coarse_run: Folder of a coarse-fewshot run of this scene to render; left out, one is trained in a part of the
-            time.
-        max_image_side: Longer side of the photos in pixels; left out, the preset's.
-        num_views: How many photos to train on, by the standard split.
-        view_ids: The photos to train on, by number, instead.
-        full: Start from the full methods' settings instead of the drafts'.
-        groups: What to measure; left out, everything.
-        rounds: Repetitions of each measurement at most.
-        vgg_weights: File with the weights of VGG-16, as for ns-train.
-        backbone: Feature network, as for ns-train.
     """
-    from sparsestyle_ns.studies.tradeoff import command
-    from sparsestyle_ns.studies.tradeoff.budget import parse_duration
+    from sparsestyle_ns.studies.tradeoff.measuring import tradeoff as run
 
-    seconds = parse_duration(budget)
-    if rounds < 1:
-        raise InputError(f"--rounds is {rounds}, but has to be at least 1.")
-    command.run(
-        command.Options(
-            dataparser=command.parse_dataparser(dataparser, data),
-            data=data,
-            output_dir=output_dir,
-            style_image=style_image,
-            coarse_run=coarse_run,
-            full=full,
-            max_image_side=max_image_side,
-            num_views=num_views,
-            view_ids=view_ids,
-            vgg_weights=vgg_weights,
-            backbone=backbone,
-            rounds=rounds,
-            groups=groups,
-        ),
-        seconds,
-    )
-
-
-@dataclass
-class StudyOptions:
-    """What `compare` and `ablate` are run on."""
-
-    data: Path
-    """Folder of the scene."""
-    style_images: Tuple[Path, ...]
-    """Paintings; each is a table of its own."""
-    output_path: Path
-    """The HTML page to write."""
-    output_dir: Path = Path("outputs/studies")
-    """Where the runs are; those that are there are used. Apart from other runs: hier-style takes the newest coarse run
-    below its own --output-dir, and must not find an ablation's."""
-    parser: str = "llff-data"
-    """nerfstudio's name of the scene's dataparser."""
-    max_image_side: Optional[int] = None
-    """Longer side, in pixels, that photos are reduced to; None: the methods' own limit."""
-    draft: bool = False
-    """Whether to run the drafts of both methods."""
-    coarse_iterations: Optional[int] = None
-    """Iterations of stage 1; None: the method's own."""
-    style_iterations: Optional[int] = None
-    """Iterations of stage 2; None: the method's own."""
-    coarse_flags: str = ""
-    """More flags of ns-train for all runs of stage 1, with an equals sign: --coarse-flags='--flag value'."""
-    style_flags: str = ""
-    """The same for all runs of stage 2: --style-flags='--flag value'."""
-    jobs: Optional[int] = None
-    """Runs at a time; None: one, or one for every four CPU cores where there is no GPU."""
+    run(options)
 
 
 @exit_on_input_error
@@ -217,10 +133,9 @@ def compare(options: Annotated[StudyOptions, tyro.conf.arg(name="")]) -> None:
     the optical flow, fine-tuning the coarse field (ARF's kind), a FreeNeRF-style field fine-tuned, and ours.
     Interrupted, the same command goes on where it was.
     """
-    from sparsestyle_ns.engine.hints import study_arguments
-    from sparsestyle_ns.studies.comparison import compare as run
+    from sparsestyle_ns.studies.paper_studies import compare as run
 
-    _write_study(options, run, "Comparison", lambda given, _: ["sparsestyle", "ablate", *study_arguments(given)])
+    run(options)
 
 
 @exit_on_input_error
@@ -232,61 +147,9 @@ def ablate(options: Annotated[StudyOptions, tyro.conf.arg(name="")]) -> None:
     without residual density, with constant content weights.
     Interrupted, the same command goes on where it was; runs that `compare` has made are used.
     """
-    from sparsestyle_ns.studies.ablations import ablate as run
+    from sparsestyle_ns.studies.paper_studies import ablate as run
 
-    _write_study(options, run, "Ablations", lambda _, stylised: ["sparsestyle", "gallery", *stylised])
-
-
-def _write_study(
-    options: StudyOptions,
-    run: Callable[..., Any],
-    title: str,
-    next_command: Callable[[StudyOptions, List[Path]], List[object]],
-) -> None:
-    """Runs a study, prints its tables and writes its page.
-
-    Args:
-        next_command: what to type next, from the options and the folders of our own stylised runs.
-    """
-    from sparsestyle_ns.data.parser_choice import check_parser
-    from sparsestyle_ns.engine.hints import finish
-    from sparsestyle_ns.studies.experiments import Laboratory, SceneSettings
-    from sparsestyle_ns.studies.study import Study
-    from sparsestyle_ns.studies.study_page import write_study
-    from sparsestyle_ns.style.painting import Painting
-    from sparsestyle_ns.utils.page import prepare_page
-
-    check_parser(options.parser)
-    if not options.data.exists():
-        raise InputError(f"There is no scene at --data {options.data}; name its folder.")
-    if not options.style_images:
-        raise InputError("There is no painting; name at least one with --style-images.")
-    if options.jobs is not None and options.jobs < 1:
-        raise InputError(f"--jobs is {options.jobs}; at least one run at a time is needed.")
-    for painting in options.style_images:
-        Painting.read(painting)
-    prepare_page(options.output_path)
-    side = options.max_image_side
-    scene = SceneSettings(
-        options.data,
-        options.parser,
-        options.output_dir,
-        () if side is None else ("--max-image-side", str(side)),
-    )
-    study = Study(
-        scene,
-        options.draft,
-        tuple(shlex.split(options.coarse_flags)),
-        tuple(shlex.split(options.style_flags)),
-        options.coarse_iterations,
-        options.style_iterations,
-    )
-    sections = run(study, options.style_images, Laboratory(scene, options.jobs))
-    for section in sections:
-        for table in section.tables:
-            table.print()
-    page = write_study(sections, options.output_path, f"{title}: {scene.name}")
-    finish(page, next_command(options, [study.stylised(painting).folder(scene) for painting in options.style_images]))
+    run(options)
 
 
 @exit_on_input_error

@@ -1,5 +1,7 @@
 """The methods that this package adds to nerfstudio: the paper's settings, and drafts for small machines."""
 
+import copy
+
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, ViewerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig, MultiStepSchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
@@ -55,19 +57,11 @@ def _coarse_fewshot(draft: bool) -> TrainerConfig:
     )
 
 
-def _coarse_fewshot_full() -> TrainerConfig:
-    return _coarse_fewshot(draft=False)
-
-
-def _coarse_fewshot_draft() -> TrainerConfig:
-    return _coarse_fewshot(draft=True)
-
-
 def _hier_style(draft: bool) -> TrainerConfig:
     """Stage 2; the draft is for images of about 128 pixels and two CPU cores."""
     return HierStyleTrainerConfig(
         _target=HierStyleTrainer,
-        coarse_method=_coarse_fewshot_draft if draft else _coarse_fewshot_full,
+        coarse_method=new_coarse_draft if draft else new_coarse,
         method_name="hier-style-draft" if draft else "hier-style",
         max_num_iterations=200,
         steps_per_save=50,
@@ -110,6 +104,18 @@ coarse_fewshot_draft = MethodSpecification(
     config=_coarse_fewshot(draft=True),
     description="coarse-fewshot for small machines: images of 128 pixels, about two minutes on two CPU cores.",
 )
+
+
+def new_coarse() -> TrainerConfig:
+    """The settings of `coarse-fewshot`, for a run of them."""
+    return copy.deepcopy(coarse_fewshot.config)
+
+
+def new_coarse_draft() -> TrainerConfig:
+    """The same of `coarse-fewshot-draft`."""
+    return copy.deepcopy(coarse_fewshot_draft.config)
+
+
 hier_style = MethodSpecification(
     config=_hier_style(draft=False),
     description="A coarse-fewshot scene in the style of a painting, --style-image FILE (stage 2).",

@@ -65,36 +65,6 @@ def after_effects(
     return [*command, "--data", str(data), *_parser(dataparser)]
 
 
-def after_tradeoff(options: Any) -> List[str]:
-    """What follows on `sparsestyle tradeoff`: training with the preset it started from.
-
-    Args:
-        options: what the command line said.
-    """
-    command = ["ns-train", "coarse-fewshot" if options.full else "coarse-fewshot-draft"]
-    for name in ("max_image_side", "num_views", "view_ids"):
-        command += _flag(f"--{name}", getattr(options, name), None)
-    return [*command, "--data", str(options.data), *_parser(options.dataparser)]
-
-
-def study_arguments(options: Any) -> List[object]:
-    """The arguments by which the one kind of study is run on the runs of the other.
-
-    Args:
-        options: a `StudyOptions`; the page is named after the ablations.
-    """
-    page = options.output_path.with_name("ablate.html")
-    start = ["--data", options.data, "--style-images", *options.style_images, "--output-path", page]
-    for each in fields(options):
-        if each.name not in ("data", "style_images", "output_path"):
-            value = getattr(options, each.name)
-            if value is True:
-                start.append(f"--{each.name}")
-            elif value != each.default:
-                start.append(f"--{each.name.replace('_', '-')}={value}")
-    return start
-
-
 def after_export(run: Path, output_path: Path, format: str) -> List[object]:
     """What follows on an export: a look at a page; of a file of points or triangles, that page."""
     if format == "html":

@@ -69,4 +69,9 @@ def save_preview(picture: Float[Tensor, "H W 3"], run: Path, iterations: int) ->
     """
     buffer = io.BytesIO()
     Image.fromarray(to8b(picture).cpu().numpy()).save(buffer, "PNG")
-    return write_whole(run / FOLDER / f"after-{iterations:06d}.png", buffer.getvalue())
+    return write_whole(preview_path(run, iterations), buffer.getvalue())
+
+
+def preview_path(run: Path, iterations: int) -> Path:
+    """Where the preview after so many iterations is, in a run's folder."""
+    return run / FOLDER / f"after-{iterations:06d}.png"

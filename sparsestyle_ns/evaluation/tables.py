@@ -27,6 +27,7 @@ LABELS: Dict[str, Tuple[str, int]] = {
     "baked_psnr": ("baked to exact, PSNR dB ↑", 1),
 }
 """A figure's name in words, with the direction that is better, and its decimals."""
+COARSE_QUALITY = ("psnr", "ssim", "lpips", "st_lpips", "effective_samples")
 STYLE_AND_CONTENT = ("style_loss", "gram_distance", "art_fid", "content_loss")
 PERCEPTUAL = ("rmse", "ssim", "lpips", "st_lpips")
 
@@ -105,8 +106,9 @@ def report_tables(means: Dict[str, float], num_views: int) -> List[Table]:
     """The tables of one run's figures, as `sparsestyle evaluate` prints them."""
     views = f"{num_views} held-out view" + "s" * (num_views > 1)
     prefix = "coarse_" if "coarse_psnr" in means else ""
-    quality = ("psnr", "ssim", "lpips", "st_lpips", "effective_samples")
-    tables = [table_of(f"Coarse field, {views}", [(f"{prefix}{k}", k, "") for k in quality], [("coarse", means)])]
+    tables = [
+        table_of(f"Coarse field, {views}", [(f"{prefix}{k}", k, "") for k in COARSE_QUALITY], [("coarse", means)])
+    ]
     if not prefix:
         return tables
     kept = [(key, key, "") for key in (*STYLE_AND_CONTENT, "content_ssim", "baked_psnr")]

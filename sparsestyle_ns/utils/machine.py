@@ -5,9 +5,10 @@ import os
 import platform
 import resource
 import sys
+import threading
 import time
 from pathlib import Path
-from typing import Any, Dict, List, Tuple
+from typing import Dict, List, Tuple, Union
 
 import psutil
 import torch
@@ -38,6 +39,37 @@ def peak_bytes(device: torch.device) -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
+class PeakMemory:
+    """The most memory that is taken inside of the `with`, in bytes: resident on a CPU, torch's own on a GPU."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.bytes = 0
+
+    def __enter__(self) -> "PeakMemory":
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
+        else:
+            self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.device.type == "cuda":
+            self.bytes = torch.cuda.max_memory_allocated(self.device)
+            return
+        self._ended.set()
+        self._thread.join()
+
+    def _look(self) -> None:
+        process = psutil.Process()
+        while True:
+            self.bytes = max(self.bytes, process.memory_info().rss)
+            if self._ended.wait(0.01):
+                return
+
+
 def core_seconds() -> Tuple[float, float]:
     """Seconds that all cores together have had, and those of them in which another process ran."""
     times = psutil.cpu_times()
@@ -59,7 +91,7 @@ class OtherLoad:
         self.before = psutil.cpu_percent(interval=1.0) / 100
         self._start = core_seconds()
 
-    def record(self) -> Dict[str, Any]:
+    def record(self) -> Dict[str, Union[float, bool]]:
         """Both shares, in [0, 1], and whether the machine counts as busy."""
         during = others_share(self._start, core_seconds())
         return {

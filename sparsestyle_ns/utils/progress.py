@@ -2,9 +2,11 @@
 
 All bars of a process are on one display, also those of several threads and bars within bars, so that none overwrites
 another and what is printed meanwhile appears above them. Of several processes that train together, the first shows
-them; where CONSOLE is quiet, nothing is shown.
+them; where CONSOLE is quiet, nothing is shown. A process that was started by another one tells it how far it is in a
+file (see `progress_file`).
 """
 
+import math
 import threading
 import time
 from contextlib import contextmanager
@@ -14,6 +16,8 @@ from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
+
+from sparsestyle_ns.utils.progress_file import ProgressReport, Work, report
 
 T = TypeVar("T")
 
@@ -27,6 +31,8 @@ SPEED_PERIOD = 120.0
 """Seconds of the past by which the time left is estimated."""
 REFRESHES = 4
 """Of the bars in a second; drawing them takes time from the work."""
+SECONDS_BETWEEN_REPORTS = 1.0
+"""Least time from one report to the process that started this one to the next."""
 
 
 class Bar:
@@ -35,9 +41,11 @@ class Bar:
     def __init__(
         self, display: Progress, description: str, total: float, done: float, unit: str, visible: bool
     ) -> None:
-        self._display, self._unit = display, unit
+        self._display, self._unit = display, f" {unit}" if unit else ""
         visible = visible and total > 1
-        number = display.add_task(description, total=total, completed=done, visible=visible, first=done, note="")
+        number = display.add_task(
+            description, total=total, completed=done, visible=visible, first=done, note="", unit=unit
+        )
         self.task = next(task for task in display.tasks if task.id == number)
         self._said, self._said_at = done, time.monotonic()
 
@@ -50,6 +58,7 @@ class Bar:
         fields = {} if note is None else {"note": note}
         task = self.task
         self._display.update(task.id, completed=done, **fields)
+        _report(self._display)
         if not self._display.disable or not task.visible or task.finished:
             return
         least, most = SECONDS_BETWEEN_LINES
@@ -84,7 +93,7 @@ def bar(description: str, total: float, done: float = 0, unit: str = "", visible
         visible: whether to show anything.
     """
     with _shared_display() as display:
-        one = Bar(display, description, total, done, f" {unit}" if unit else "", visible)
+        one = Bar(display, description, total, done, unit, visible)
         try:
             yield one
         finally:
@@ -137,6 +146,18 @@ def _can_draw() -> bool:
 _lock = threading.Lock()
 _display: Optional[Progress] = None
 _users = 0
+_reported_at = -math.inf
+
+
+def _report(display: Progress) -> None:
+    """Tells the process that started this one how far all work is, not too often."""
+    global _reported_at
+    with _lock:
+        if time.monotonic() - _reported_at < SECONDS_BETWEEN_REPORTS or not comms.is_main_process():
+            return
+        _reported_at = time.monotonic()
+        works = (Work(task.description, task.completed, task.total, task.fields["unit"]) for task in display.tasks)
+        report(ProgressReport(tuple(works)))
 
 
 @contextmanager

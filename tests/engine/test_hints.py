@@ -2,7 +2,6 @@
 
 import shlex
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import tyro
@@ -11,16 +10,12 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.scripts import train
 from PIL import Image
 
-from sparsestyle_ns import cli
-from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.engine.hints import (
     after_effects,
     after_evaluation,
     after_export,
-    after_tradeoff,
     finish,
     resume_command,
-    study_arguments,
 )
 
 
@@ -74,35 +69,6 @@ def test_after_the_effects_comes_training_on_the_same_views() -> None:
     assert config.pipeline.coarse_run == Path("run")
     assert config.pipeline.style_image == Path("hat.jpg")
     assert config.pipeline.datamanager.num_views == 5
-
-
-def test_after_the_trade_off_comes_training_with_the_preset_that_was_measured() -> None:
-    parser = LLFFDataParserConfig(eval_interval=4)
-    options = SimpleNamespace(
-        full=False, max_image_side=64, num_views=4, view_ids=None, data=Path("fern"), dataparser=parser
-    )
-    config = parsed(after_tradeoff(options))
-    assert config.method_name == "coarse-fewshot-draft"
-    assert config.pipeline.datamanager.max_image_side == 64
-    assert config.pipeline.datamanager.num_views == 4
-    assert config.pipeline.datamanager.dataparser.eval_interval == 4
-
-
-def test_after_the_comparison_come_the_ablations_of_the_same_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    given = []
-    monkeypatch.setattr(cli, "_write_study", lambda options, *_: given.append(options))
-    options = cli.StudyOptions(
-        data=Path("fern"),
-        style_images=(Path("a.jpg"), Path("b c.jpg")),
-        output_path=Path("pages/compare.html"),
-        draft=True,
-        max_image_side=64,
-        style_flags="--pipeline.samples-per-chunk 65536",
-        jobs=2,
-    )
-    cli.main(["ablate", *map(str, study_arguments(options))])
-    expected = {**vars(options), "output_path": Path("pages/ablate.html")}
-    assert vars(given[0]) == expected
 
 
 def test_a_page_is_looked_at_and_points_become_a_page(tmp_path: Path) -> None:

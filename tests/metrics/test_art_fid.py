@@ -27,8 +27,8 @@ from sparsestyle_ns.metrics.art_fid import (
 )
 from sparsestyle_ns.metrics.image import ALEXNET_FILE, lpips_metric
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
-from sparsestyle_ns.studies import study
-from sparsestyle_ns.studies.comparison import style_table
+from sparsestyle_ns.studies.paper_tables import style_table
+from sparsestyle_ns.studies.run_figures import PaintingMeasure, RunFigures, read_figures
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 
@@ -208,13 +208,13 @@ def test_without_its_weights_it_is_left_out_and_the_files_are_named(
 def test_a_row_of_a_study_has_it_for_every_fourth_frame(with_weights: None, painting: Path) -> None:
     stylised, coarse = ([torch.rand(40, 50, 3) for _ in range(5)] for _ in range(2))
     frames = PathFrames(stylised, coarse, [SimpleNamespace(covered=torch.ones(40, 50, dtype=torch.bool))] * 5)
-    figures = study.Painter(painting).figures(frames, HierStylePipelineConfig(feature_side=48))
+    figures = PaintingMeasure(painting).figures(frames, HierStylePipelineConfig(feature_side=48))
     expected = ArtFID.against(Painting.read(painting).pixels)
     for index in (0, 4):
         expected.add(stylised[index], coarse[index])
     assert figures["art_fid"] == pytest.approx(expected.figures()["art_fid"])
     ours = {**figures, "style_loss_before": 0.1, "gram_distance_before": 0.1}
-    table = style_table({"ours": study.Measured(ours, [])})
+    table = style_table({"ours": RunFigures(ours, [])})
     assert "ArtFID ↓" in table.columns and table.note == ""
 
 
@@ -223,7 +223,7 @@ def test_rows_of_a_study_are_measured_again_once_there_are_weights(
 ) -> None:
     def known(figures: Dict[str, float]) -> bool:
         (tmp_path / "figures.json").write_text(json.dumps({"step": 7, "figures": figures}))
-        return study._read(tmp_path, 7) is not None
+        return read_figures(tmp_path, 7) is not None
 
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     assert known({"style_loss": 0.1}) and known({"style_loss": 0.1, "art_fid": 2.0})

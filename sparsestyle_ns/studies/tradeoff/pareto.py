@@ -8,7 +8,7 @@ TIME_EXPONENT = 1 / 8
 
 
 def pareto_front(times: Sequence[float], errors: Sequence[float]) -> List[int]:
-    """The points than which no other is as fast and as accurate, from the fastest on.
+    """The points that no other beats in both, from the fastest on.
 
     Of points that are equal in both, the first.
     """
@@ -22,7 +22,7 @@ def pareto_front(times: Sequence[float], errors: Sequence[float]) -> List[int]:
 
 
 def knee(times: Sequence[float], errors: Sequence[float], exponent: float = TIME_EXPONENT) -> Optional[int]:
-    """The point with the smallest error · time^a; None of none.
+    """The point with the smallest error · time^a; None where there are no points.
 
     It doesn't depend on the units of either, and lies on the front. Of equals, the fastest.
 
@@ -36,7 +36,7 @@ def knee(times: Sequence[float], errors: Sequence[float], exponent: float = TIME
 
 
 def fastest_within(times: Sequence[float], errors: Sequence[float], limit: float) -> Optional[int]:
-    """The fastest point with an error of at most `limit`; the most accurate one where there is none; None of none."""
+    """The fastest point with an error of at most `limit`, else the most accurate; None where there are no points."""
     front = pareto_front(times, errors)
     within = [point for point in front if errors[point] <= limit]
     return (within[:1] or front[-1:] or [None])[0]

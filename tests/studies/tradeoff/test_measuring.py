@@ -1,7 +1,6 @@
 """The whole command on a tiny scene. Its clock goes on by a hundredth of a second with every look at it, so that what
 fits into the budget doesn't depend on the machine."""
 
-import io
 import json
 import sys
 from pathlib import Path
@@ -12,39 +11,37 @@ import pytest
 sys.path.append(str(Path(__file__).parent))
 
 from clock import FakeClock
-from rich.console import Console
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.method_configs import method_config
-from sparsestyle_ns.studies.tradeoff import command, stage1
-from sparsestyle_ns.studies.tradeoff.budget import Budget
-from sparsestyle_ns.studies.tradeoff.study import Study, squeezed
+from sparsestyle_ns.studies.options import TradeoffOptions
+from sparsestyle_ns.studies.study import Study, get_setting, parse_dataparser
+from sparsestyle_ns.studies.tradeoff import measuring
+from sparsestyle_ns.studies.tradeoff.measure_training import StageRuns
+from sparsestyle_ns.studies.tradeoff.time_budget import Budget
+from sparsestyle_ns.studies.tradeoff.workbench import Workbench, squeezed
 from sparsestyle_ns.utils.errors import InputError
 
 TICK = 0.01
-OVERRIDES = {
-    "coarse-fewshot": {
-        "max_num_iterations": 8,
-        "pipeline.datamanager.train_num_rays_per_batch": 32,
-        "pipeline.model.coarse_field.layer_width": 16,
-        "pipeline.model.coarse_field.feature_dim": 4,
-        "pipeline.model.num_eval_samples": 8,
-        "pipeline.model.precision": "float32",
-    },
-    "hier-style": {
-        "max_num_iterations": 2,
-        "pipeline.warm_start_steps": 1,
-        "pipeline.feature_side": 48,
-        "pipeline.model.hash_levels": 2,
-        "pipeline.model.log2_table_size": 10,
-        "pipeline.model.num_steps": 8,
-        "pipeline.model.layer_width": 16,
-        "pipeline.model.occupancy_resolution": 8,
-        "pipeline.model.bake_resolution": 32,
-        "pipeline.model.precision": "float32",
-    },
-}
+COARSE_FLAGS = (
+    *("--pipeline.datamanager.train-num-rays-per-batch", "32"),
+    *("--pipeline.model.coarse-field.layer-width", "16"),
+    *("--pipeline.model.coarse-field.feature-dim", "4"),
+    *("--pipeline.model.num-eval-samples", "8"),
+    *("--pipeline.model.precision", "float32"),
+)
+STYLE_FLAGS = (
+    *("--pipeline.warm-start-steps", "1"),
+    *("--pipeline.feature-side", "48"),
+    *("--pipeline.model.hash-levels", "2"),
+    *("--pipeline.model.log2-table-size", "10"),
+    *("--pipeline.model.num-steps", "8"),
+    *("--pipeline.model.layer-width", "16"),
+    *("--pipeline.model.occupancy-resolution", "8"),
+    *("--pipeline.model.bake-resolution", "32"),
+    *("--pipeline.model.precision", "float32"),
+)
 AXES = {
     "training": ["stage-1 iterations", "width", "levels", "batch"],
     "quadrature": ["samples", "steps", "skipping", "stopping"],
@@ -55,22 +52,22 @@ AXES = {
 }
 
 
-def make_options(scene, folder, **more):
-    return command.Options(
-        dataparser=LLFFDataParserConfig(), data=scene, output_dir=folder, rounds=1, overrides=OVERRIDES, **more
-    )
+def make_study(scene, dataparser=None, **more):
+    tiny = {"coarse_iterations": 8, "style_iterations": 2, "coarse_flags": COARSE_FLAGS, "style_flags": STYLE_FLAGS}
+    return Study(scene, dataparser or LLFFDataParserConfig(), **tiny, **more)
 
 
-def measure(options, seconds):
+def measure(scene, folder, seconds, dataparser=None, **more):
     clock = FakeClock(TICK)
-    return command.measure(options, Budget(seconds, clock), Console(file=io.StringIO())), clock
+    options = TradeoffOptions(scene, output_dir=folder, rounds=1, **more)
+    return measuring.measure(make_study(scene, dataparser), options, Budget(seconds, clock)), clock
 
 
 @pytest.fixture(scope="module")
 def content(llff_scene, painting, tmp_path_factory):
     """The JSON report of a run with time for everything."""
     folder = tmp_path_factory.mktemp("report")
-    report, _ = measure(make_options(llff_scene, folder, style_image=painting), seconds=1000.0)
+    report, _ = measure(llff_scene, folder, 1000.0, style_image=painting)
     report.write(folder)
     return json.loads((folder / "tradeoff.json").read_text())
 
@@ -98,17 +95,15 @@ def test_every_axis_has_a_front_one_recommended_point_and_a_flag(content):
 
 
 def test_every_flag_is_one_of_the_methods(content):
-    from sparsestyle_ns.studies.tradeoff.axis import Knob
-
     configs = [method_config("coarse-fewshot"), method_config("hier-style")]
     for axis in content["axes"]:
-        knob = Knob("", "", axis["flag"].removeprefix("--").replace("-", "_"), ())
-        assert any(reads(knob, config) for config in configs), axis["flag"]
+        place = axis["flag"].removeprefix("--").replace("-", "_")
+        assert any(has_setting(config, place) for config in configs), axis["flag"]
 
 
-def reads(knob, config):
+def has_setting(config, place):
     try:
-        knob.read(config)
+        get_setting(config, place)
     except AttributeError:
         return False
     return True
@@ -147,8 +142,7 @@ def test_baked_pictures_are_compared_with_exact_ones(content):
 
 
 def test_without_a_painting_what_stylises_is_left_out(llff_scene, tmp_path):
-    options = make_options(llff_scene, tmp_path, groups=("style", "rendering"))
-    report, _ = measure(options, seconds=1000.0)
+    report, _ = measure(llff_scene, tmp_path, 1000.0, groups=("style", "rendering"))
     assert report.left_out == ["Style (stage 2): there is no painting; name one with --style-image."]
     assert [axis.name for axis in report.measured] == ["stage-1 iterations", "baking"]
     assert "there is no painting" in report.measured[1].note
@@ -160,15 +154,12 @@ def test_a_blender_scene_is_measured_too(tmp_path):
     sizes = ["--num-train", "9", "--num-val", "1", "--num-test", "1", "--width", "16"]
     make_sample_scene.main([str(tmp_path), "--layout", "blender", *sizes])
     scene = tmp_path / "blender"
-    options = make_options(scene, tmp_path, groups=("quadrature",))
-    options.dataparser = command.parse_dataparser((), scene)
-    report, _ = measure(options, seconds=1000.0)
+    report, _ = measure(scene, tmp_path, 1000.0, parse_dataparser((), scene), groups=("quadrature",))
     assert [axis.name for axis in report.measured] == ["stage-1 iterations", *AXES["quadrature"]]
 
 
 def test_the_budget_is_kept_and_what_does_not_fit_is_named(llff_scene, painting, tmp_path):
-    options = make_options(llff_scene, tmp_path, style_image=painting)
-    report, clock = measure(options, seconds=2.0)
+    report, clock = measure(llff_scene, tmp_path, 2.0, style_image=painting)
     # Only what is under way when time runs out may still end: a few looks at the clock.
     assert clock.now <= 2.0 + 20 * TICK
     assert report.measured
@@ -177,27 +168,25 @@ def test_the_budget_is_kept_and_what_does_not_fit_is_named(llff_scene, painting,
 
 
 def test_ctrl_c_leaves_a_report_of_what_there_was(llff_scene, tmp_path, monkeypatch):
-    def interrupt(self, axis, knob, budget):
+    def interrupt(self, curves, budget):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(stage1.Stage1, "_short", interrupt)
-    report, _ = measure(make_options(llff_scene, tmp_path, groups=("training",)), seconds=1000.0)
+    monkeypatch.setattr(StageRuns, "_short", interrupt)
+    report, _ = measure(llff_scene, tmp_path, 1000.0, groups=("training",))
     assert [axis.name for axis in report.measured] == ["stage-1 iterations"]
     assert report.left_out == ["Stopped by Ctrl-C; what was measured before is here."]
 
 
-def test_a_coarse_run_is_taken_where_one_is_given(runs, llff_scene, tmp_path):
-    options = make_options(llff_scene, tmp_path, coarse_run=runs.coarse)
-    study = Study(options, Budget(1000.0, FakeClock(TICK)))
-    assert study.coarse_model.config.coarse_field.layer_width == 32
-    assert 0 < study.own_error < 1
-    assert study.model_to_render().field.feature_dim == 8
+def test_a_coarse_run_is_taken_where_one_is_given(runs, llff_scene):
+    bench = Workbench(make_study(llff_scene), Budget(1000.0, FakeClock(TICK)), coarse_run=runs.coarse)
+    assert bench.coarse_model.config.coarse_field.layer_width == 32
+    assert 0 < bench.own_error < 1
+    assert bench.model_to_render().field.feature_dim == 8
 
 
-def test_a_coarse_run_of_other_views_is_refused(runs, llff_scene, tmp_path):
-    options = make_options(llff_scene, tmp_path, coarse_run=runs.coarse, num_views=2)
+def test_a_coarse_run_of_other_views_is_refused(runs, llff_scene):
     with pytest.raises(InputError, match="doesn't fit"):
-        Study(options, Budget(1000.0, FakeClock(TICK)))
+        Workbench(make_study(llff_scene, num_views=2), Budget(1000.0, FakeClock(TICK)), coarse_run=runs.coarse)
 
 
 def test_schedules_end_with_the_iterations_there_are():
@@ -212,7 +201,7 @@ def test_schedules_end_with_the_iterations_there_are():
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--data", "{tmp}/gone"], "Error: There is no {tmp}/gone; name a scene's folder"),
+        (["--data", "{tmp}/gone"], "Error: There is no scene at --data {tmp}/gone; name its folder"),
         (["--data", "{tmp}"], "Error: {tmp} has none of poses_bounds.npy"),
         (["--data", "{tmp}", "--budget", "soon"], "Error: --budget soon is no duration"),
         (["--data", "{tmp}", "--rounds", "0"], "Error: --rounds is 0"),
@@ -226,16 +215,26 @@ def test_what_can_not_be_used_is_said_in_one_sentence(tmp_path, arguments, sente
 
 
 def test_the_last_line_names_the_report_and_trains_on_the_scene(tmp_path, monkeypatch, capsys):
+    (tmp_path / "poses_bounds.npy").touch()
     report = SimpleNamespace(
         write=lambda folder: folder / "index.html", recommendation=["Take 4."], everything_left_out=lambda: []
     )
-    monkeypatch.setattr(command, "measure", lambda *_: report)
-    command.run(make_options(Path("fern"), tmp_path), 10.0)
-    train = "ns-train coarse-fewshot-draft --data fern llff-data"
-    assert capsys.readouterr().out.splitlines() == ["Take 4.", f"Made {tmp_path / 'index.html'} – next: {train}"]
+    monkeypatch.setattr(measuring, "measure", lambda *_: report)
+    options = TradeoffOptions(
+        tmp_path, ("llff-data", "--eval-interval", "4"), output_dir=tmp_path, max_image_side=64, num_views=4
+    )
+    measuring.tradeoff(options)
+    train = f"ns-train coarse-fewshot-draft --num-views 4 --max-image-side 64 --data {tmp_path} llff-data"
+    last = f"Made {tmp_path / 'index.html'} – next: {train} --eval-interval 4"
+    assert capsys.readouterr().out.splitlines() == ["Take 4.", last]
 
 
-def test_the_dataparser_is_known_from_the_files_or_named_with_its_options(llff_scene):
-    assert isinstance(command.parse_dataparser((), llff_scene), LLFFDataParserConfig)
-    named = command.parse_dataparser(("llff-data", "--eval-interval", "4"), llff_scene)
-    assert named.eval_interval == 4
+def test_options_become_the_study(tmp_path):
+    (tmp_path / "poses_bounds.npy").touch()
+    options = TradeoffOptions(tmp_path, full=True, view_ids=(1, 2), backbone="vgg16", vgg_weights=Path("mine.pth"))
+    study = measuring.study_of(options)
+    config = study.config("hier-style", style_image=Path("hat.jpg"))
+    assert (config.method_name, config.pipeline.style_image) == ("hier-style", Path("hat.jpg"))
+    assert (config.pipeline.backbone, config.pipeline.vgg_weights) == ("vgg16", Path("mine.pth"))
+    assert config.pipeline.datamanager.view_ids == (1, 2)
+    assert config.pipeline.datamanager.max_image_side == method_config("hier-style").pipeline.datamanager.max_image_side

@@ -6,150 +6,138 @@ import math
 import re
 
 import pytest
-
-from sparsestyle_ns.method_configs import method_config
-from sparsestyle_ns.studies.tradeoff.axis import Axis, Knob, with_setting
-from sparsestyle_ns.studies.tradeoff.pareto import root_mean_square
 from sparsestyle_ns.studies.tradeoff.report import Report
 from sparsestyle_ns.studies.tradeoff.words import duration, recommendation, setting_line
+
+from sparsestyle_ns.studies.tradeoff.pareto import root_mean_square
 from sparsestyle_ns.utils.errors import InputError
 
 
-def quadrature_axis(errors=(0.1, 0.02, 0.004), preset="32", own_error=0.1):
-    axis = Axis(
+def quadrature_curve(errors=(0.1, 0.02, 0.004), preset="32", own_error=0.1):
+    curve = Curve(
         *("quadrature", "samples", "Samples a ray", "--pipeline.model.num-eval-samples", preset),
         *("view_seconds", "rmse", [("view_seconds", "rmse")]),
         own_error=own_error,
     )
     for number, error in zip((16, 32, 64), errors, strict=True):
         for seconds in (0.1, 0.12, 0.11):
-            axis.add(number, {"view_seconds": seconds * number, "rmse": error}, busy=False)
-    return axis
+            curve.add(number, {"view_seconds": seconds * number, "rmse": error}, busy=False)
+    return curve
 
 
-def training_axis():
-    axis = Axis(
+def training_curve():
+    curve = Curve(
         *("training", "stage-1 iterations", "Iterations of stage 1", "--max-num-iterations", "2500"),
         *("train_seconds", "psnr", [("train_seconds", "psnr"), ("train_seconds", "ssim")]),
     )
     for iterations, seconds, psnr in ((100, 10.0, 17.0), (400, 40.0, 19.1), (800, 80.0, 19.6), (1600, 160.0, 20.1)):
-        axis.add(iterations, {"train_seconds": seconds, "psnr": psnr, "ssim": 0.5}, busy=iterations == 800)
-    return axis
+        curve.add(iterations, {"train_seconds": seconds, "psnr": psnr, "ssim": 0.5}, busy=iterations == 800)
+    return curve
 
 
-def width_axis(narrow=19.0, preset=18.0):
-    axis = Axis(
+def width_curve(narrow=19.0, preset=18.0):
+    curve = Curve(
         *("training", "width", "Width", "--pipeline.model.coarse-field.layer-width", "256"),
         *("train_seconds", "psnr", [("train_seconds", "psnr")]),
     )
     for setting, end in (("256", preset), ("128", narrow)):
         for moment, seconds, loss in (("stop 1", 5.0, 2.0), ("stop 2", 20.0, 0.0)):
-            axis.add(setting, {"train_seconds": seconds, "psnr": end - loss}, False, moment)
-    return axis
+            curve.add(setting, {"train_seconds": seconds, "psnr": end - loss}, False, moment)
+    return curve
 
 
-def rendering_axis():
-    axis = Axis(
+def rendering_curve():
+    curve = Curve(
         *("rendering", "baking", "Exact and baked", "--pipeline.model.bake-resolution", "exact"),
         *("view_seconds", "rmse", [("fps", "psnr")]),
     )
-    axis.add("exact", {"view_seconds": 2.0, "fps": 0.5, "rmse": 0.0, "psnr": math.inf}, False)
-    axis.add(256, {"view_seconds": 0.1, "fps": 10.0, "rmse": 0.02, "psnr": 34.0}, False)
-    return axis
+    curve.add("exact", {"view_seconds": 2.0, "fps": 0.5, "rmse": 0.0, "psnr": math.inf}, False)
+    curve.add(256, {"view_seconds": 0.1, "fps": 10.0, "rmse": 0.02, "psnr": 34.0}, False)
+    return curve
 
 
 def make_report(*axes, **more):
     return Report("fern, 3 photos, 126 × 94", {"device": "a <CPU>", "versions": {"torch": "2"}}, list(axes), **more)
 
 
-# ------------------------------------------------------------------------------------------------------------- an axis
+# ------------------------------------------------------------------------------------------------------------- a curve
 
 
 def test_repetitions_give_median_and_spread():
-    spread = quadrature_axis().find(32).spread("view_seconds")
+    spread = quadrature_curve().find(32).spread("view_seconds")
     assert (spread.low, spread.median, spread.high, spread.count) == pytest.approx((3.2, 3.52, 3.84, 3))
 
 
 def test_an_error_that_only_saves_time_may_cost_a_tenth_of_a_decibel():
     # The field has 20 dB. 0.02 costs 0.17 dB, 0.004 next to nothing.
-    assert quadrature_axis().recommended.setting == "64"
-    assert quadrature_axis(errors=(0.1, 0.015, 0.004)).recommended.setting == "32"
-    assert "20.0 dB" in quadrature_axis().rule
+    assert quadrature_curve().recommended.setting == "64"
+    assert quadrature_curve(errors=(0.1, 0.015, 0.004)).recommended.setting == "32"
+    assert "20.0 dB" in quadrature_curve().rule
 
 
 def test_what_all_settings_cost_alike_is_no_reason_to_take_the_slowest():
     # All cost more than a tenth of a decibel, and the last two within a tenth of each other.
-    assert quadrature_axis(errors=(0.1, 0.041, 0.04)).recommended.setting == "32"
-    assert quadrature_axis(errors=(0.1, 0.06, 0.04)).recommended.setting == "64"
+    assert quadrature_curve(errors=(0.1, 0.041, 0.04)).recommended.setting == "32"
+    assert quadrature_curve(errors=(0.1, 0.06, 0.04)).recommended.setting == "64"
 
 
 def test_a_run_is_recommended_up_to_where_time_no_longer_pays():
     # 2.1 dB for two doublings is worth it, 0.5 dB for one isn't: 0.75 would be.
-    assert training_axis().recommended.setting == "400"
+    assert training_curve().recommended.setting == "400"
 
 
 def test_a_point_measured_on_a_busy_machine_stays_marked():
-    axis = quadrature_axis()
-    axis.add(16, {"view_seconds": 9.0, "rmse": 0.1}, busy=True)
-    axis.add(16, {"view_seconds": 1.6, "rmse": 0.1}, busy=False)
-    assert [point.busy for point in axis.points] == [True, False, False]
-
-
-def test_a_knob_is_named_as_ns_train_names_it():
-    config = method_config("coarse-fewshot-draft")
-    knob = Knob("width", "Width", "pipeline.model.coarse_field.layer_width", (128,))
-    assert knob.flag == "--pipeline.model.coarse-field.layer-width"
-    changed = with_setting(config, knob.path, 64)
-    assert (knob.read(changed), knob.read(config)) == (64, 256)
-    with pytest.raises(AttributeError, match=r"no pipeline\.model\.no_such"):
-        with_setting(config, "pipeline.model.no_such", 1)
+    curve = quadrature_curve()
+    curve.add(16, {"view_seconds": 9.0, "rmse": 0.1}, busy=True)
+    curve.add(16, {"view_seconds": 1.6, "rmse": 0.1}, busy=False)
+    assert [point.busy for point in curve.points] == [True, False, False]
 
 
 # --------------------------------------------------------------------------------------------------------------- words
 
 
 def test_the_recommendation_is_derived_from_the_measurements():
-    line, *_ = recommendation([training_axis()])
+    line, *_ = recommendation([training_curve()])
     assert line.startswith(
-        "Stage 1 (--max-num-iterations): draft: 40 s, 19.1 dB (400 iterations); "
-        "standard: 2:40 min, 20.1 dB (1600 iterations); beyond that 1 dB costs 4× the time"
+        "Iterations of stage 1 (--max-num-iterations): for a draft 400 (40 s, 19.1 dB); "
+        "for the best result 1600 (2:40 min, 20.1 dB); after that 1 dB more takes 4× the time"
     )
     assert "measured once" in line
 
 
 def test_a_preset_that_is_recommended_is_kept():
-    line = setting_line(quadrature_axis(preset="64"))
+    line = setting_line(quadrature_curve(preset="64"))
     assert line.startswith("Samples a ray (--pipeline.model.num-eval-samples): keep 64")
     assert "32 would be 2× as fast" in line
 
 
 def test_a_better_setting_is_named_with_what_it_changes():
-    line = setting_line(quadrature_axis(errors=(0.1, 0.015, 0.004), preset="64"))
+    line = setting_line(quadrature_curve(errors=(0.1, 0.015, 0.004), preset="64"))
     assert "32 instead of 64: 2× as fast, costs 0.097 dB against photos instead of 0.0069" in line
 
 
 def test_the_observed_order_is_said():
-    axis = quadrature_axis()
-    axis.order = 1.46
-    assert recommendation([axis])[0].endswith("Observed order of convergence: 1.5.")
+    curve = quadrature_curve()
+    curve.order = 1.46
+    assert recommendation([curve])[0].endswith("Observed order of convergence: 1.5.")
 
 
 def test_a_setting_that_is_hardly_faster_is_no_reason_to_change():
-    axis = quadrature_axis(errors=(0.001, 0.001, 0.001), preset="32")
-    axis.points[0].values["view_seconds"] = [3.5]  # 16 samples take as long as 32, but for a hair
-    assert axis.recommended.setting == "16"
-    assert "keep 32; 16: " in setting_line(axis)
+    curve = quadrature_curve(errors=(0.001, 0.001, 0.001), preset="32")
+    curve.points[0].values["view_seconds"] = [3.5]  # 16 samples take as long as 32, but for a hair
+    assert curve.recommended.setting == "16"
+    assert "keep 32; 16 would be no better: " in setting_line(curve)
 
 
 def test_of_runs_the_ends_are_compared():
-    assert "128 instead of 256: 19.00 dB instead of 18.00" in setting_line(width_axis())
-    assert "keep 256" in setting_line(width_axis(narrow=17.0))
+    assert "128 instead of 256: 19.00 dB instead of 18.00" in setting_line(width_curve())
+    assert "keep 256" in setting_line(width_curve(narrow=17.0))
 
 
 def test_a_busy_machine_is_named():
-    axis = quadrature_axis(preset="64")
-    axis.find(64).busy = True
-    assert setting_line(axis).endswith("[the machine was busy]")
+    curve = quadrature_curve(preset="64")
+    curve.find(64).busy = True
+    assert setting_line(curve).endswith("[the machine was busy]")
 
 
 @pytest.mark.parametrize(("seconds", "words"), [(0.354, "0.35 s"), (40.2, "40 s"), (185.0, "3:05 min")])
@@ -161,11 +149,11 @@ def test_durations_in_words(seconds, words):
 
 
 def test_the_json_report_has_all_axes_with_front_and_recommended_point(tmp_path):
-    axis = quadrature_axis(errors=(0.1, 0.2, 0.004))
-    axis.order = 1.5
-    make_report(axis, training_axis(), left_out=["Style: no painting"]).write(tmp_path)
+    curve = quadrature_curve(errors=(0.1, 0.2, 0.004))
+    curve.order = 1.5
+    make_report(curve, training_curve(), left_out=["Style: no painting"]).write(tmp_path)
     content = json.loads((tmp_path / "tradeoff.json").read_text())
-    assert [axis["name"] for axis in content["axes"]] == ["stage-1 iterations", "samples"]
+    assert [curve["name"] for curve in content["axes"]] == ["stage-1 iterations", "samples"]
     samples = content["axes"][1]
     assert samples["flag"] == "--pipeline.model.num-eval-samples"
     assert samples["observed_order"] == 1.5
@@ -178,7 +166,7 @@ def test_the_json_report_has_all_axes_with_front_and_recommended_point(tmp_path)
 
 
 def test_json_has_no_infinity(tmp_path):
-    make_report(rendering_axis()).write(tmp_path)
+    make_report(rendering_curve()).write(tmp_path)
 
     def refuse(word):
         raise AssertionError(word)
@@ -188,7 +176,7 @@ def test_json_has_no_infinity(tmp_path):
 
 
 def test_the_csv_has_a_row_for_each_figure(tmp_path):
-    make_report(quadrature_axis()).write(tmp_path)
+    make_report(quadrature_curve()).write(tmp_path)
     rows = list(csv.DictReader(io.StringIO((tmp_path / "tradeoff.csv").read_text())))
     assert len(rows) == 3 * 2
     assert {row["setting"] for row in rows if row["recommended"] == "1"} == {"64"}
@@ -196,7 +184,7 @@ def test_the_csv_has_a_row_for_each_figure(tmp_path):
 
 
 def test_the_page_needs_nothing_else_and_trusts_no_name(tmp_path):
-    path = make_report(quadrature_axis(), width_axis(), rendering_axis(), training_axis()).write(tmp_path)
+    path = make_report(quadrature_curve(), width_curve(), rendering_curve(), training_curve()).write(tmp_path)
     page = path.read_text()
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert all(source.startswith("data:") for source in sources)
@@ -204,7 +192,7 @@ def test_the_page_needs_nothing_else_and_trusts_no_name(tmp_path):
     assert len(plots) == 1 + 1 + 1 + 2
     assert all(b"<svg" in plot for plot in plots)
     assert "a &lt;CPU&gt;" in page
-    assert "draft: 40 s, 19.1 dB" in page
+    assert "for a draft 400 (40 s, 19.1 dB)" in page
     assert page.index("In short") < page.index("Quadrature")
     assert (tmp_path / "tradeoff.png").read_bytes().startswith(b"\x89PNG")
 
@@ -222,5 +210,5 @@ def test_a_folder_that_can_not_be_written_to_is_said_in_one_sentence(tmp_path):
 
 
 def test_psnr_stands_for_the_error_that_has_it():
-    axis = width_axis()
-    assert axis.error_of(axis.points[-1]) == pytest.approx(root_mean_square(19.0))
+    curve = width_curve()
+    assert curve.error_of(curve.points[-1]) == pytest.approx(root_mean_square(19.0))

@@ -1,12 +1,11 @@
-"""One axis: what was measured at each value of one setting."""
+"""A curve of error against time: what was measured at each value of one setting."""
 
-import copy
 import math
 import statistics
 from dataclasses import dataclass, field
-from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple, Union
+from typing import Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple, Union
 
-from sparsestyle_ns.studies.tradeoff.budget import Budget, Costs, OutOfTimeError
+from sparsestyle_ns.studies.options import Group
 from sparsestyle_ns.studies.tradeoff.pareto import (
     TIME_EXPONENT,
     decibels,
@@ -15,23 +14,17 @@ from sparsestyle_ns.studies.tradeoff.pareto import (
     fastest_within,
     knee,
     pareto_front,
+    root_mean_square,
 )
-from sparsestyle_ns.utils.machine import LoadWatch
 
-Values = Dict[str, Union[float, Sequence[float]]]
+Values = Mapping[str, Union[float, Sequence[float]]]
 """What one measurement found: a number, or several repetitions of it, for each metric."""
 FREE_LOSS = 0.1
 """dB against the photos that nobody misses: what an error may cost that is there only to save time."""
 
 
-@dataclass(frozen=True)
-class Metric:
-    """What a number is.
-
-    Attributes:
-        label: in words, with its unit.
-        log: whether its axis is logarithmic.
-    """
+class Metric(NamedTuple):
+    """What a number is: in words, with its unit, and whether its scale is logarithmic."""
 
     label: str
     log: bool = False
@@ -54,8 +47,7 @@ METRICS = {
 """Every number that is measured. Those of PSNR and SSIM are better the larger, as frames a second are."""
 
 
-@dataclass(frozen=True)
-class Spread:
+class Spread(NamedTuple):
     """Median, smallest and largest of some repetitions."""
 
     median: float
@@ -80,6 +72,11 @@ class Point:
     values: Dict[str, List[float]] = field(default_factory=dict)
     busy: bool = False
 
+    @property
+    def name(self) -> str:
+        """The setting, and the moment where there is one."""
+        return f"{self.setting} {self.moment}".rstrip()
+
     def spread(self, metric: str) -> Spread:
         """Of the repetitions of a metric."""
         values = self.values[metric]
@@ -90,12 +87,12 @@ class Point:
         return statistics.median(self.values[metric])
 
 
-@dataclass
-class Axis:
+@dataclass(eq=False)
+class Curve:
     """A curve of error against time for one setting.
 
     Attributes:
-        group: quadrature, training, fine-field, style, rendering or precision.
+        group: what it is part of.
         name: unique.
         title: in words.
         flag: the setting's flag on the command line.
@@ -111,14 +108,14 @@ class Axis:
         order: the observed order of convergence.
     """
 
-    group: str
+    group: Group
     name: str
     title: str
     flag: str
     preset: str
     time: str
     error: str
-    plots: List[Tuple[str, str]]
+    plots: Sequence[Tuple[str, str]]
     note: str = ""
     own_error: Optional[float] = None
     points: List[Point] = field(default_factory=list)
@@ -137,13 +134,16 @@ class Axis:
 
     def find(self, setting: object, moment: str = "") -> Optional[Point]:
         """The point at a value of the setting; None where it wasn't measured."""
-        matches = (point for point in self.points if (point.setting, point.moment) == (str(setting), moment))
-        return next(matches, None)
+        return next((p for p in self.points if (p.setting, p.moment) == (str(setting), moment)), None)
 
     def last(self, setting: object) -> Optional[Point]:
         """The latest moment of the run with a value of the setting."""
-        points = [point for point in self.points if point.setting == str(setting)]
-        return points[-1] if points else None
+        return next((point for point in reversed(self.points) if point.setting == str(setting)), None)
+
+    @property
+    def metrics(self) -> List[str]:
+        """All that was measured, in order."""
+        return list(dict.fromkeys(metric for point in self.points for metric in point.values))
 
     @property
     def has_runs(self) -> bool:
@@ -153,14 +153,14 @@ class Axis:
     def error_of(self, point: Point) -> float:
         """The error between which and time there is to choose; 0 or more."""
         value = point.median(self.error)
-        return 10.0 ** (-value / 20.0) if self.error == "psnr" else value
+        return root_mean_square(value) if self.error == "psnr" else value
 
     def _times_and_errors(self) -> Tuple[List[float], List[float]]:
         return [point.median(self.time) for point in self.points], [self.error_of(point) for point in self.points]
 
     @property
     def front(self) -> List[Point]:
-        """Points that no other beats, from the fastest on."""
+        """The Pareto front, from the fastest point on."""
         return [self.points[index] for index in pareto_front(*self._times_and_errors())]
 
     @property
@@ -172,10 +172,7 @@ class Axis:
 
     @property
     def free_error(self) -> float:
-        """The error that costs `FREE_LOSS` dB more than that of the most accurate point; `own_error` must be known.
-
-        Not than none at all: what other settings cost is in all points, and can't be saved here.
-        """
+        """The error that costs `FREE_LOSS` dB more than that of the most accurate point; `own_error` must be known."""
         least = min(map(self.error_of, self.points), default=0.0)
         return error_that_costs(FREE_LOSS + decibels_lost(least, self.own_error), self.own_error)
 
@@ -188,28 +185,20 @@ class Axis:
                 f"{1 - 2**-TIME_EXPONENT:.0%} off the error."
             )
         return (
-            f"Recommended: the fastest that costs at most {FREE_LOSS:g} dB more against photos than the most accurate: "
-            f"the field itself has {decibels(self.own_error):.1f} dB there, so {decibels(self.free_error):.1f} dB here."
+            f"Recommended: the fastest setting that loses at most {FREE_LOSS:g} dB against photos to the most accurate "
+            f"one. The field itself has {decibels(self.own_error):.1f} dB against photos; with it, "
+            f"{decibels(self.free_error):.1f} dB here are enough."
         )
 
-    def content(self) -> Dict[str, Any]:
-        """What the JSON report says of the axis."""
+    def content(self) -> Dict[str, object]:
+        """What the JSON report says of the curve."""
         front, recommended = self.front, self.recommended
-        metrics = dict.fromkeys(metric for point in self.points for metric in point.values)
+        named = ("group", "name", "title", "flag", "preset", "time", "error", "rule", "note", "left_out")
         return {
-            "group": self.group,
-            "name": self.name,
-            "title": self.title,
-            "flag": self.flag,
-            "preset": self.preset,
-            "time": self.time,
-            "error": self.error,
+            **{name: getattr(self, name) for name in named},
             "plots": [list(plot) for plot in self.plots],
-            "metrics": {metric: METRICS[metric].label for metric in metrics},
-            "rule": self.rule,
-            "note": self.note,
+            "metrics": {metric: METRICS[metric].label for metric in self.metrics},
             "observed_order": self.order,
-            "left_out": self.left_out,
             "points": [
                 {
                     "setting": point.setting,
@@ -217,91 +206,13 @@ class Axis:
                     "on_front": point in front,
                     "recommended": point is recommended,
                     "busy": point.busy,
-                    "values": {
-                        metric: {name: finite(value) for name, value in vars(point.spread(metric)).items()}
-                        for metric in point.values
-                    },
+                    "values": {metric: _for_json(point.spread(metric)) for metric in point.values},
                 }
                 for point in self.points
             ],
         }
 
 
-def finite(value: float) -> Optional[float]:
+def _for_json(spread: Spread) -> Dict[str, Optional[float]]:
     """JSON has no infinity: None for it (the PSNR of equal pictures)."""
-    return value if math.isfinite(value) else None
-
-
-@dataclass(frozen=True)
-class Knob:
-    """A setting and the values to measure beside the preset's, those that matter most first.
-
-    Attributes:
-        name: short and unique.
-        title: in words.
-        path: its place in a method's config.
-        values: to measure.
-    """
-
-    name: str
-    title: str
-    path: str
-    values: Tuple[Any, ...]
-
-    @property
-    def flag(self) -> str:
-        """As ns-train has it."""
-        return "--" + self.path.replace("_", "-")
-
-    def read(self, config: Any) -> Any:
-        """Its value in a config."""
-        for name in self.path.split("."):
-            config = getattr(config, name)
-        return config
-
-
-def with_setting(config: Any, path: str, value: Any) -> Any:
-    """A copy of a config with the value of one setting, given by its place, changed."""
-    config = copy.deepcopy(config)
-    *parents, name = path.split(".")
-    part = config
-    for parent in parents:
-        part = getattr(part, parent)
-    if not hasattr(part, name):
-        raise AttributeError(f"{type(config).__name__} has no {path}")
-    setattr(part, name, value)
-    return config
-
-
-def in_turns(
-    axis: Axis,
-    cases: Dict[Any, Callable[[], Values]],
-    budget: Budget,
-    rounds: int,
-    watch: LoadWatch,
-) -> None:
-    """Measures cases in turn, A B C A B C …, until each has all its rounds or time is over.
-
-    So a slow spell of the machine meets all of them. A case that took longer than what is left isn't begun again; one
-    that never was is left out, and the axis says so.
-
-    Args:
-        cases: by the value of the setting, what measures it once.
-        rounds: repetitions of each at most.
-    """
-    costs = Costs()
-    try:
-        for _ in range(rounds):
-            for setting, measure in cases.items():
-                if budget.left <= costs.expected(str(setting)):
-                    continue
-                start = budget.clock()
-                with watch:
-                    values = measure()
-                costs.note(str(setting), budget.clock() - start)
-                axis.add(setting, values, watch.busy)
-    except OutOfTimeError:
-        pass
-    finally:
-        missing = [str(setting) for setting in cases if axis.find(setting) is None]
-        axis.left_out += [f"{setting}: no time was left" for setting in missing]
+    return {name: value if math.isfinite(value) else None for name, value in spread._asdict().items()}

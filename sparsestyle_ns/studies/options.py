@@ -1,0 +1,86 @@
+"""What the command lines of the studies say. Imports next to nothing, so that help is there at once."""
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, List, Literal, Optional, Tuple
+
+import tyro
+
+Group = Literal["quadrature", "training", "fine-field", "style", "rendering", "precision"]
+
+
+@dataclass
+class StudyOptions:
+    """What `compare` and `ablate` are run on."""
+
+    data: Path
+    """Folder of the scene."""
+    style_images: Tuple[Path, ...]
+    """Paintings; each is a table of its own."""
+    output_path: Path
+    """The HTML page to write."""
+    output_dir: Path = Path("outputs/studies")
+    """Where the runs are; those that are there are used. Apart from other runs: hier-style takes the newest coarse run
+    below its own --output-dir, and must not find an ablation's."""
+    parser: str = "llff-data"
+    """nerfstudio's name of the scene's dataparser."""
+    max_image_side: Optional[int] = None
+    """Longer side, in pixels, that photos are reduced to; None: the methods' own limit."""
+    draft: bool = False
+    """Whether to run the drafts of both methods."""
+    coarse_iterations: Optional[int] = None
+    """Iterations of stage 1; None: the method's own."""
+    style_iterations: Optional[int] = None
+    """Iterations of stage 2; None: the method's own."""
+    coarse_flags: str = ""
+    """More flags of ns-train for all runs of stage 1, with an equals sign: --coarse-flags='--flag value'."""
+    style_flags: str = ""
+    """The same for all runs of stage 2: --style-flags='--flag value'."""
+    jobs: Optional[int] = None
+    """Runs at a time; None: one, or one for every four CPU cores where there is no GPU."""
+
+    def ablate_command(self) -> List[object]:
+        """The command that runs the ablations on the same runs."""
+        other = replace(self, output_path=self.output_path.with_name("ablate.html"))
+        command: List[object] = ["sparsestyle", "ablate", "--data", other.data, "--style-images", *other.style_images]
+        command += ["--output-path", other.output_path]
+        for each in fields(other)[3:]:
+            value, flag = getattr(other, each.name), f"--{each.name.replace('_', '-')}"
+            if value != each.default:
+                command.append(flag if value is True else f"{flag}={value}")
+        return command
+
+
+@dataclass
+class TradeoffOptions:
+    """What `tradeoff` is run on."""
+
+    data: Path
+    """The scene, as for ns-train."""
+    dataparser: Annotated[Tuple[str, ...], tyro.conf.Positional] = ()
+    """How to read it, where its files don't tell: llff-data, blender-data, colmap …; its options come after two dashes:
+    -- llff-data --eval-interval 4."""
+    style_image: Optional[Path] = None
+    """The painting; without it, what stylises is left out."""
+    budget: str = "10m"
+    """Time that it may take, such as 90s, 10m or 1h30m. More of it gives longer runs and more repetitions."""
+    output_dir: Path = Path("tradeoff")
+    """Folder of the report."""
+    coarse_run: Optional[Path] = None
+    """Folder of a coarse-fewshot run of this scene to render; left out, one is trained in a part of the time."""
+    max_image_side: Optional[int] = None
+    """Longer side of the photos in pixels; left out, the preset's."""
+    num_views: Optional[int] = None
+    """How many photos to train on, by the standard split."""
+    view_ids: Optional[Tuple[int, ...]] = None
+    """The photos to train on, by number, instead."""
+    full: bool = False
+    """Start from the full methods' settings instead of the drafts'."""
+    groups: Tuple[Group, ...] = ()
+    """What to measure; left out, everything."""
+    rounds: int = 3
+    """Repetitions of each measurement at most."""
+    vgg_weights: Optional[Path] = None
+    """File with the weights of VGG-16, as for ns-train."""
+    backbone: Literal["auto", "vgg16", "vgg16-shift-tolerant"] = "auto"
+    """Feature network, as for ns-train."""

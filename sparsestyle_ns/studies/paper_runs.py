@@ -1,0 +1,107 @@
+"""The runs of the paper's tables: each *kind* of stage 1 or stage 2 is a set of settings of the same methods."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Dict, Mapping, Optional, Tuple
+
+from sparsestyle_ns.studies.runs import Run, as_pairs
+from sparsestyle_ns.studies.study import Stage, Study
+from sparsestyle_ns.style.backbones import available_backbone
+
+Settings = Mapping[str, object]
+"""Values by their place in a method's config."""
+
+HIGH_FREQUENCIES: Settings = {"pipeline.model.coarse_field.num_levels": 10, "pipeline.model.distortion_weight": 0.0}
+VANILLA: Settings = {**HIGH_FREQUENCIES, "pipeline.model.coarse_field.num_layers": 8}
+COARSE_KINDS: Dict[str, Settings] = {
+    "ours": {},
+    "paper": {"pipeline.model.distortion_weight": 0.0},
+    "vanilla": VANILLA,
+    "dietnerf": {**VANILLA, "pipeline.semantic_weight": 0.1},
+    "freenerf": {
+        **HIGH_FREQUENCIES,
+        "pipeline.model.frequency_reveal": 0.9,
+        "pipeline.model.occlusion_weight": 0.01,
+    },
+}
+"""Stage 1: as it is; as the paper writes it, on colours alone; NeRF's ten octaves, eight layers, view dependence; the
+same with a semantic loss of DietNeRF's kind; and ten octaves with FreeNeRF's regularisers."""
+COLORS_ALONE: Settings = {"pipeline.effects.view_color": "on", "pipeline.effects.matched_depth": "off"}
+"""What both stages have to be told of every kind of stage 1 but ours."""
+FINE_TUNING: Settings = {
+    "pipeline.model.stylised_field": "coarse",
+    "optimizers.fields.optimizer.lr": 5e-4,
+    "pipeline.loss_weights.content": 0.1,
+    "pipeline.content_decay": 1.0,
+    # A sample's activations take twice the memory that the residual field's do, and are all kept.
+    "pipeline.samples_per_chunk": 131072,
+}
+STYLE_KINDS: Dict[str, Settings] = {
+    "ours": {},
+    "arf": FINE_TUNING,
+    "ec-only": {"pipeline.model.fine_encoding": "none"},
+    "frequency": {"pipeline.model.fine_encoding": "frequency"},
+    "coarse-density": {"pipeline.effects.residual_density": "off"},
+    **{
+        f"lambda-{weight:g}": {"pipeline.loss_weights.content": weight, "pipeline.content_decay": 1.0}
+        for weight in (10.0, 1.0, 0.1)
+    },
+}
+"""Stage 2: as it is; the coarse field itself fine-tuned, as ARF does, at stage 1's learning rate and with the content
+weight that ours ends with; and the paper's ablations."""
+EVERY_LOSS: Settings = {"logging.steps_per_log": 1}
+"""Plots of the losses take those of every iteration."""
+PICTURES = (20, 100)
+"""Iterations after which the paper shows what different content weights have done (Fig. 7 a)."""
+
+
+@dataclass
+class PaperRuns:
+    """The runs on one scene.
+
+    Attributes:
+        study: the scene.
+        output_dir: where the runs are.
+        found_backbone: the feature network of all runs, unless the study's flags name weights; None: there is none.
+    """
+
+    study: Study
+    output_dir: Path
+    found_backbone: Optional[str] = field(default_factory=available_backbone)
+
+    def __post_init__(self) -> None:
+        stages: Tuple[Stage, Stage] = ("coarse-fewshot", "hier-style")
+        # Parses the flags, too, so that a wrong one is known before anything is trained.
+        self._own_weights = {stage: self.study.config(stage).pipeline.vgg_weights is not None for stage in stages}
+
+    def _network(self, stage: Stage) -> Settings:
+        """One network for all runs, whatever can be downloaded by the time that they begin."""
+        if self.found_backbone is None or self._own_weights[stage]:
+            return {}
+        return {"pipeline.backbone": self.found_backbone}
+
+    def coarse_kinds(self) -> Tuple[str, ...]:
+        """The kinds of stage 1 that can be trained here: without weights of a feature network, not `dietnerf`."""
+        found = self.found_backbone is not None or self._own_weights["coarse-fewshot"]
+        return tuple(kind for kind in COARSE_KINDS if found or kind != "dietnerf")
+
+    def coarse(self, kind: str) -> Run:
+        """The run of stage 1 of a kind."""
+        network = self._network("coarse-fewshot") if kind == "dietnerf" else {}
+        settings = as_pairs(COARSE_KINDS[kind], {} if kind == "ours" else COLORS_ALONE, network)
+        return Run(self.study, self.output_dir, kind, "coarse-fewshot", settings)
+
+    def stylised(self, painting: Path, style_kind: str = "ours", coarse_kind: str = "ours") -> Run:
+        """The run of stage 2 of a kind, on a coarse field of a kind."""
+        iterations = self.study.iterations("hier-style")
+        colors = {} if coarse_kind == "ours" else COLORS_ALONE
+        return Run(
+            self.study,
+            self.output_dir,
+            name=f"{coarse_kind}-{style_kind}-{painting.stem}",
+            stage="hier-style",
+            settings=as_pairs(STYLE_KINDS[style_kind], colors, EVERY_LOSS, self._network("hier-style")),
+            painting=painting,
+            coarse=self.coarse(coarse_kind),
+            pictures=(*(count for count in PICTURES if count < iterations), iterations),
+        )

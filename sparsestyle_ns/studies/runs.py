@@ -1,0 +1,256 @@
+"""Training the runs that a table needs: each once, resumable, several at a time where the machine has room.
+
+A run's folder carries a digest of everything that decides the outcome, so that a run is found again by what it is: a
+finished one is used as it is, an interrupted one is gone on with.
+"""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple
+
+import torch
+import yaml
+
+from sparsestyle_ns.engine.previews import preview_path
+from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
+from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.studies.study import Stage, Study
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import write_whole
+from sparsestyle_ns.utils.progress import bar, duration, say
+from sparsestyle_ns.utils.progress_file import PROGRESS_FILE, ProgressReport
+
+SECONDS_FILE = "training_seconds.json"
+TRAINING_PROCESS = (sys.executable, "-m", "sparsestyle_ns.studies.training_process")
+CORES_PER_JOB = 4
+"""CPU cores that a run makes good use of."""
+SECONDS_BETWEEN_LOOKS = 2.0
+"""At how far a run is."""
+PICTURE_SIDE = 256
+"""Longer side, in pixels, of pictures of a run on its way."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A training run that a table needs.
+
+    Attributes:
+        study: its scene and presets.
+        output_dir: what `ns-train --output-dir` names.
+        name: short name, part of the run's folder.
+        stage: which of the two.
+        settings: beside the preset's, by their place in the config, as pairs.
+        painting: the style image, of a stylised run.
+        coarse: the run whose field it stylises.
+        pictures: iterations after which a picture is made of it on its way (see `picture_after`).
+    """
+
+    study: Study
+    output_dir: Path
+    name: str
+    stage: Stage
+    settings: Tuple[Tuple[str, object], ...] = ()
+    painting: Optional[Path] = None
+    coarse: Optional["Run"] = None
+    pictures: Tuple[int, ...] = ()
+
+    @property
+    def method(self) -> str:
+        """The name that ns-train knows its preset by."""
+        return self.study.method(self.stage)
+
+    @property
+    def iterations(self) -> int:
+        """How many it has when it is finished."""
+        return self.study.iterations(self.stage)
+
+    @property
+    def digest(self) -> str:
+        """Eight hexadecimal digits of all that decides the outcome but the program itself."""
+        study = self.study
+        parts = [self.method, self.iterations, *self.settings, *study.flags(self.stage), study.data.resolve()]
+        parts += [study.dataparser, study.max_image_side, study.num_views, study.view_ids]
+        if self.painting is not None:
+            parts.append(hashlib.sha256(self.painting.read_bytes()).hexdigest())
+        if self.coarse is not None:
+            parts.append(self.coarse.digest)
+        return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()[:8]
+
+    @property
+    def folder(self) -> Path:
+        """Where it is."""
+        return self.output_dir / self.study.name / self.method / f"{self.name}-{self.digest}"
+
+    @property
+    def steps_done(self) -> int:
+        """Iterations that its newest checkpoint has behind it."""
+        checkpoint = newest_checkpoint(self.folder / "nerfstudio_models")
+        return 0 if checkpoint is None else checkpoint_step(checkpoint) + 1
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether it has all its iterations."""
+        return self.steps_done >= self.iterations
+
+    def config(self) -> SparseStyleTrainerConfig:
+        """The config that trains it to its end, from where it is."""
+        config = self.study.config(self.stage, dict(self.settings), self.painting)
+        config.output_dir, config.experiment_name = self.output_dir, self.study.name
+        config.timestamp = self.folder.name
+        config.previews = tuple(count / self.iterations for count in self.pictures)
+        config.preview_side = PICTURE_SIDE
+        config.vis, config.viewer.quit_on_train_completion = "tensorboard", True
+        if self.steps_done > 0:
+            config.load_dir = self.folder / "nerfstudio_models"
+        elif self.coarse is not None:
+            config.pipeline.coarse_run = self.coarse.folder
+        return config
+
+
+def picture_after(folder: Path, iterations: int) -> Path:
+    """Where a run's picture after so many iterations is: a held-out photo, the unstylised view and the stylised one."""
+    return preview_path(folder, iterations)
+
+
+class TimeSpent(NamedTuple):
+    """What a run has taken so far, all its processes together."""
+
+    seconds: float
+    iterations: int
+
+    @classmethod
+    def read(cls, path: Path) -> "TimeSpent":
+        """From a file; nothing where there is none, or one that was cut short."""
+        try:
+            return cls(**json.loads(path.read_text()))
+        except (OSError, ValueError, TypeError):
+            return cls(0.0, 0)
+
+
+@dataclass
+class RunQueue:
+    """Trains the runs of one study.
+
+    Attributes:
+        folder: where they all are; has their logs, too.
+        jobs: runs at a time; None for one on a machine of few cores or with a GPU, else one for every four cores.
+        say: told what goes on, a line at a time.
+    """
+
+    folder: Path
+    jobs: Optional[int] = None
+    say: Callable[[str], None] = say
+
+    def train(self, runs: Sequence[Run]) -> None:
+        """Brings all runs, and the coarse ones they build on, to their end; named twice, one is trained once.
+
+        Raises:
+            InputError: a run failed, or Ctrl-C was pressed; either way what is done is kept.
+        """
+        try:
+            self._train_all(list(dict.fromkeys(runs)))
+        except KeyboardInterrupt as interrupt:
+            raise InputError("Interrupted; the same command goes on where it was.") from interrupt
+
+    def _train_all(self, runs: Sequence[Run]) -> None:
+        coarse = list(dict.fromkeys(run.coarse for run in runs if run.coarse is not None))
+        wanted = [*coarse, *(run for run in runs if run not in coarse)]
+        self.say(self.forecast(wanted))
+
+        def train(run: Run, jobs: int) -> None:
+            self._train(run, jobs)
+            if not all(other.is_finished for other in wanted):
+                self.say(self.forecast(wanted))
+
+        for stage in (coarse, runs):
+            left = [run for run in stage if not run.is_finished]
+            jobs = min(self._jobs(), len(left))
+            if jobs < 2:  # in this thread, which is the one that Ctrl-C reaches
+                for run in left:
+                    train(run, 1)
+                continue
+            with ThreadPoolExecutor(jobs) as pool:
+                try:
+                    list(pool.map(lambda run, jobs=jobs: train(run, jobs), left))
+                except BaseException:
+                    pool.shutdown(cancel_futures=True)
+                    raise
+
+    def forecast(self, wanted: Sequence[Run]) -> str:
+        """How much is to do and how long it will take, by what earlier runs of the same methods took."""
+        left = [run for run in wanted if not run.is_finished]
+        line = f"{len(wanted)} runs, {len(wanted) - len(left)} of them finished."
+        rates = self._seconds_per_iteration()
+        known = [run for run in left if run.method in rates]
+        seconds = sum(rates[run.method] * (run.iterations - run.steps_done) for run in known)
+        if known:
+            line += f" {len(known)} take about {duration(seconds / self._jobs())}, as earlier runs did."
+        if len(known) < len(left):
+            line += f" How long {len(left) - len(known)} take will be known once the first of their kind runs."
+        return line
+
+    def _jobs(self) -> int:
+        if self.jobs is not None:
+            return self.jobs
+        return 1 if torch.cuda.is_available() else max(1, (os.cpu_count() or 1) // CORES_PER_JOB)
+
+    def _seconds_per_iteration(self) -> Dict[str, float]:
+        """Of each method the mean over its runs that are on this disk."""
+        rates: Dict[str, List[float]] = {}
+        for path in self.folder.glob(f"*/*/{SECONDS_FILE}"):
+            spent = TimeSpent.read(path)
+            if spent.iterations > 0:
+                rates.setdefault(path.parents[1].name, []).append(spent.seconds / spent.iterations)
+        return {method: sum(values) / len(values) for method, values in rates.items()}
+
+    def _train(self, run: Run, jobs: int) -> None:
+        name, done, total, start = run.folder.name, run.steps_done, run.iterations, time.monotonic()
+        base = self.folder / "logs" / name
+        log, config_path, progress = (Path(f"{base}.{suffix}") for suffix in ("log", "yml", "progress.json"))
+        write_whole(config_path, yaml.dump(run.config()))
+        progress.unlink(missing_ok=True)
+        self.say(f"{name}: iterations {done} to {total}; the log is {log}")
+        environment = {**os.environ, PROGRESS_FILE: str(progress)}
+        if jobs > 1:
+            environment["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // jobs))
+        with (
+            log.open("a") as output,
+            subprocess.Popen(
+                [*TRAINING_PROCESS, str(config_path)], stdout=output, stderr=subprocess.STDOUT, env=environment
+            ) as process,
+        ):
+            _follow(process, progress, name, total, done)
+        if process.returncode != 0 or not run.is_finished:
+            failure = ProgressReport.read(progress).failure or f"its process ended with status {process.returncode}"
+            raise InputError(f"The run {name} didn't finish ({failure}); all it said is in {log}.")
+        seconds, before = time.monotonic() - start, TimeSpent.read(run.folder / SECONDS_FILE)
+        self.say(f"{name}: {total - done} iterations in {duration(seconds)}")
+        spent = TimeSpent(before.seconds + seconds, before.iterations + total - done)
+        write_whole(run.folder / SECONDS_FILE, json.dumps(spent._asdict()) + "\n")
+
+
+def _follow(process: subprocess.Popen, progress: Path, name: str, iterations: int, done: int) -> None:
+    """Waits for a run, and shows how far it is by what it reports."""
+    with bar(name, iterations, done, "iterations") as shown:
+        while process.poll() is None:
+            try:
+                process.wait(timeout=SECONDS_BETWEEN_LOOKS)
+            except KeyboardInterrupt:  # the run got it too, and saves what it has
+                process.wait()
+                raise
+            except subprocess.TimeoutExpired:
+                for work in ProgressReport.read(progress).works:
+                    if work.unit == "iterations":
+                        shown.reach(work.done)
+
+
+def as_pairs(*settings: Mapping[str, object]) -> Tuple[Tuple[str, object], ...]:
+    """Settings as a run has them; of those that are given twice the last counts."""
+    return tuple({place: value for part in settings for place, value in part.items()}.items())

@@ -1,0 +1,198 @@
+"""Runs of both stages: what held-out views are like, against the time of training, of an iteration, and memory."""
+
+import math
+from typing import Dict, List, NamedTuple, Sequence, Tuple
+
+from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
+from sparsestyle_ns.studies.options import Group
+from sparsestyle_ns.studies.study import flag_of, get_setting, with_setting
+from sparsestyle_ns.studies.tradeoff.curves import Curve, Values
+from sparsestyle_ns.studies.tradeoff.time_budget import Budget, Case, OutOfTimeError, Plan, in_turns
+from sparsestyle_ns.studies.tradeoff.workbench import Workbench, squeezed
+from sparsestyle_ns.utils.machine import PeakMemory
+
+LONG_STOPS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1)
+SHORT_STOPS = (1 / 4, 1 / 2, 1)
+"""Shares of a run at which it is evaluated."""
+MIN_ITERATIONS = 3
+EVALUATION_SHARE = 0.3
+"""Part of a run's time that evaluating it may take; how often, and on how many views, follows from it."""
+WARM_START_SHARE = 0.8
+"""Part of a stylised run's time that its iterations may take; the warm start comes before."""
+
+
+class Knob(NamedTuple):
+    """A setting and the values to measure beside the preset's, those that matter most first."""
+
+    name: str
+    title: str
+    place: str
+    factors: Tuple[float, ...] = ()
+    steps: Tuple[int, ...] = ()
+    values: Tuple[int, ...] = ()
+
+    def around(self, preset: int) -> Tuple[int, ...]:
+        """The values to measure: multiples of the preset's, steps from it, and values of their own."""
+        near = (*(int(preset * factor) for factor in self.factors), *(preset + step for step in self.steps))
+        return tuple(value for value in (*near, *self.values) if value >= 1)
+
+
+KNOBS: Dict[Group, Tuple[Knob, ...]] = {
+    "training": (
+        Knob("width", "Width of the coarse field", "pipeline.model.coarse_field.layer_width", (1 / 2, 1 / 4)),
+        Knob("levels", "Octaves of the encoding", "pipeline.model.coarse_field.num_levels", steps=(-2, 2)),
+        Knob("batch", "Rays a batch", "pipeline.datamanager.train_num_rays_per_batch", (1 / 4, 4)),
+    ),
+    "fine-field": (
+        Knob("hash levels", "Levels of the hash grid", "pipeline.model.hash_levels", (1 / 2, 2)),
+        Knob("resolution", "Finest level's cells", "pipeline.model.max_resolution", (1 / 2, 2)),
+        Knob("table", "Length of a level's table (log2)", "pipeline.model.log2_table_size", steps=(-2, -4)),
+    ),
+    "style": (
+        Knob("feature size", "Size that the feature network sees", "pipeline.feature_side", (1 / 2, 2)),
+        Knob("style features", "Style features that count", "pipeline.style_features", values=(1024, 128)),
+    ),
+}
+
+
+class RunPlan(NamedTuple):
+    """A run that fits into a time: how many iterations it has, and when and on which views it is evaluated."""
+
+    iterations: int
+    stops: List[int]
+    views: Sequence[int]
+
+
+class StageRuns:
+    """Runs of one stage: a long one, whose field other curves build on, and short ones for each value of a setting.
+
+    The short runs take equally long in stage 1, whose settings change what an iteration costs; in stage 2 they have
+    equally many iterations.
+    """
+
+    def __init__(self, bench: Workbench, is_style: bool) -> None:
+        self.bench, self.is_style = bench, is_style
+        self.preset = bench.style_config if is_style else bench.coarse_config
+        self.metrics = ("style_loss", "content_loss") if is_style else ("psnr", "ssim")
+
+    def long_plan(self) -> Plan:
+        """Quality over iterations, along one long run."""
+        stage, group, weight = ("2", "style", 15) if self.is_style else ("1", "training", 20)
+        curve = self._curve(group, f"stage-{stage} iterations", f"Iterations of stage {stage}", "max_num_iterations")
+        return Plan([curve], weight, lambda budget: self._long(curve, budget))
+
+    def short_plan(self, groups: Sequence[Group]) -> Plan:
+        """All settings of some groups, which share the preset's run."""
+        curves = {k: self._curve(group, k.name, k.title, k.place) for group in groups for k in KNOBS[group]}
+        weight = (2.5 if self.is_style else 3.5) * (1 + 2 * len(curves))
+        return Plan(list(curves.values()), weight, lambda budget: self._short(curves, budget))
+
+    def _curve(self, group: Group, name: str, title: str, place: str) -> Curve:
+        time, plots = "train_seconds", [("train_seconds", metric) for metric in self.metrics]
+        if group == "fine-field":
+            time = "step_seconds"
+            plots = [*((time, metric) for metric in self.metrics), ("memory_mb", self.metrics[0])]
+        preset = str(get_setting(self.preset, place))
+        return Curve(group, name, title, flag_of(place), preset, time, self.metrics[0], plots)
+
+    def _config(self) -> SparseStyleTrainerConfig:
+        return self.bench.adapted_style_config() if self.is_style else self.preset
+
+    def _fitting(self, config: SparseStyleTrainerConfig, budget: Budget, shares: Sequence[float]) -> RunPlan:
+        """A run that fits into the budget; a few iterations, and a view, are tried to find out.
+
+        Args:
+            shares: of the run, at which it is evaluated where there is time for all of them.
+        """
+        bench = self.bench
+        budget.check()
+        if self.is_style:
+            config = with_setting(config, "pipeline.warm_start_steps", 0)
+            if bench.scene_views is None:
+                bench.start(config, budget)  # freezes the views, once for all runs
+                budget.check()
+        setup, probe = bench.timed(lambda: bench.start(config, budget))
+        step, model = bench.step_seconds(probe, budget), probe.pipeline.model
+        if type(model) not in bench.view_seconds:
+            bench.evaluate(model, bench.views[:1])
+        seconds = max(bench.view_seconds[type(model)], 1e-9)
+        # At least the last stop, and at least one view.
+        shares = shares[-max(1, int(EVALUATION_SHARE * budget.left / seconds)) :]
+        views = bench.views[: max(1, int(EVALUATION_SHARE * budget.left / (len(shares) * seconds)))]
+        left = budget.left - setup - len(shares) * len(views) * seconds
+        fitting = max(MIN_ITERATIONS, int((WARM_START_SHARE if self.is_style else 1.0) * left / step))
+        iterations = min(config.max_num_iterations, fitting)
+        return RunPlan(iterations, sorted({math.ceil(iterations * share) for share in shares}), views)
+
+    def _long(self, curve: Curve, budget: Budget) -> None:
+        bench, config = self.bench, self._config()
+        plan = self._fitting(config, budget, LONG_STOPS)
+        curve.note = (
+            f"One run of {config.method_name}, its schedules fitted to {plan.iterations} iterations (the preset has "
+            f"{config.max_num_iterations}); mean over {len(plan.views)} held-out views. The clock stands still while "
+            f"they are evaluated{', and during preparation and warm start' if self.is_style else ''}."
+        )
+        training = bench.start(squeezed(config, plan.iterations), budget)
+        model, seconds = training.pipeline.model, 0.0
+        if self.is_style:
+            bench.keep_style(model)
+        for stop in plan.stops:
+            with bench.watch:
+                seconds += sum(bench.train(training, stop, budget, bench.seconds_to_evaluate(model, plan.views)))
+            if not self.is_style and bench.trains_coarse:
+                bench.keep_coarse(model)
+            values = {"train_seconds": seconds, **bench.evaluate(model, plan.views)}
+            curve.add(training.num_steps, values, bench.watch.busy)
+            if training.num_steps < stop:
+                break
+
+    def _short(self, curves: Dict[Knob, Curve], budget: Budget) -> None:
+        bench, config = self.bench, self._config()
+        presets = {knob: get_setting(config, knob.place) for knob in curves}
+        values = {knob: knob.around(preset) for knob, preset in presets.items()}
+        share = budget.left / (1.5 + sum(map(len, values.values())))
+        plan = self._fitting(config, budget.part(share), SHORT_STOPS[1:] if self.is_style else SHORT_STOPS)
+        what = f"{plan.iterations} iterations" if self.is_style else f"{share:.3g} s with its evaluations"
+        for curve in curves.values():
+            curve.note = (
+                f"One run of {what} for each value, its schedules fitted to them; mean over {len(plan.views)} held-out "
+                f"views{', with the features and the painting of the preset for all' if self.is_style else ''}."
+            )
+
+        def case(points: Sequence[Tuple[Curve, object]], config: SparseStyleTrainerConfig) -> Case:
+            return Case(points, lambda round_: self._run(config, plan, share, budget, round_))
+
+        cases = [case([(curves[knob], preset) for knob, preset in presets.items()], config)]
+        for knob, around in values.items():
+            cases += [case([(curves[knob], value)], with_setting(config, knob.place, value)) for value in around]
+        in_turns(cases, budget, bench.rounds, bench.watch)
+
+    def _run(
+        self, config: SparseStyleTrainerConfig, plan: RunPlan, seconds: float, budget: Budget, seed: int
+    ) -> Dict[str, Values]:
+        """What was found at the stops of one run, and as that of no moment, of its iterations.
+
+        Raises:
+            OutOfTimeError: it was stopped before its end in stage 2: fewer iterations than the others have can't be set
+                beside them.
+        """
+        bench = self.bench
+        bench.collect_garbage()  # what is left of the run before would count as this one's memory
+        if not self.is_style:
+            budget = budget.part(seconds)
+            iterations = self._fitting(config, budget, SHORT_STOPS).iterations
+            stops = [math.ceil(iterations * stop / plan.iterations) for stop in plan.stops]
+            plan = RunPlan(iterations, stops, plan.views)
+        training = bench.start(squeezed(config, plan.iterations), budget, seed)
+        model, steps, memory, found = training.pipeline.model, [], 0, {}
+        for number, stop in enumerate(plan.stops, 1):
+            with PeakMemory(bench.device) as peak:
+                steps += bench.train(training, stop, budget, bench.seconds_to_evaluate(model, plan.views))
+            if self.is_style and training.num_steps < stop:
+                raise OutOfTimeError
+            memory, values = max(memory, peak.bytes), bench.evaluate(model, plan.views)
+            done = {"train_seconds": sum(steps), "iterations": training.num_steps}
+            found[f"stop {number}"] = {**done, **values}
+            if training.num_steps < stop:
+                break
+        return {**found, "": {"step_seconds": steps[1:] or steps, "memory_mb": memory / 1e6, **values}}

@@ -1,0 +1,171 @@
+"""`sparsestyle tradeoff`: measures all curves within a budget and writes the report, also when it is stopped."""
+
+import contextlib
+import gc
+import tempfile
+import warnings
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Dict, Iterator, List, Tuple
+
+import rich
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.console import Console
+
+from sparsestyle_ns.engine.hints import finish, scene_arguments
+from sparsestyle_ns.studies.options import TradeoffOptions
+from sparsestyle_ns.studies.study import Study, parse_dataparser
+from sparsestyle_ns.studies.tradeoff.measure_rendering import baking_plan, precision_plan, quadrature_plans
+from sparsestyle_ns.studies.tradeoff.measure_training import StageRuns
+from sparsestyle_ns.studies.tradeoff.time_budget import Budget, Plan, parse_duration, run_plans
+from sparsestyle_ns.studies.tradeoff.tradeoff_report import GROUPS, Fact, Report, cant_write
+from sparsestyle_ns.studies.tradeoff.workbench import Workbench
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.machine import device_name, versions
+
+REPORT_SECONDS = 4.0
+REPORT_SHARE = 0.05
+"""Time that is kept for writing the report: so many seconds, but no larger part of the budget."""
+
+
+def tradeoff(options: TradeoffOptions) -> None:
+    """Measures, writes the report, and prints the recommendation.
+
+    Raises:
+        InputError: something in the options can't be used.
+    """
+    budget_seconds = parse_duration(options.budget)
+    if options.rounds < 1:
+        raise InputError(f"--rounds is {options.rounds}, but has to be at least 1.")
+    study = study_of(options)
+    try:
+        report = measure(study, options, Budget(budget_seconds))
+    except KeyboardInterrupt:
+        raise SystemExit("Stopped before anything was measured.") from None
+    page = report.write(options.output_dir)
+    lines = report.recommendation or ["Nothing could be measured in the time there was; give a larger --budget."]
+    left_out = report.everything_left_out()
+    if left_out:
+        lines += [f"Left out, {len(left_out)}:", *(f"  {line}" for line in left_out)]
+    Console().print(*lines, sep="\n", markup=False, highlight=False, soft_wrap=True)
+    method = study.method("coarse-fewshot")
+    finish(page.resolve(), ["ns-train", method, *scene_arguments(study.config("coarse-fewshot"), method)])
+
+
+def study_of(options: TradeoffOptions) -> Study:
+    """The scene and the presets that the options name."""
+    return Study(
+        options.data,
+        parse_dataparser(options.dataparser, options.data),
+        draft=not options.full,
+        max_image_side=options.max_image_side,
+        num_views=options.num_views,
+        view_ids=options.view_ids,
+        vgg_weights=options.vgg_weights,
+        backbone=options.backbone,
+    )
+
+
+def measure(study: Study, options: TradeoffOptions, budget: Budget) -> Report:
+    """Measures what fits into the budget.
+
+    Ctrl-C ends it; what has been measured is in the report.
+
+    Raises:
+        InputError: the scene, the painting or the coarse run can't be used.
+    """
+    check_folder(options.output_dir)
+    seconds, stopped = budget.left, []
+    with quiet(), rich.console.Console().status("Loading the scene") as status:
+        bench = Workbench(study, budget, options.style_image, options.coarse_run, options.rounds)
+        plans, left_out = all_plans(bench, options)
+
+        def begin(plan: Plan) -> None:
+            titles = ", ".join(curve.title for curve in plan.curves)
+            status.update(f"{plan.curves[0].group}: {titles}, {budget.spent:.0f} s of {seconds:.0f} s have passed")
+
+        try:
+            run_plans(plans, budget.part(budget.left - min(REPORT_SECONDS, REPORT_SHARE * seconds)), begin)
+        except KeyboardInterrupt:
+            stopped = ["Stopped by Ctrl-C; what was measured before is here."]
+        finally:
+            gc.unfreeze()
+    curves = [curve for plan in plans for curve in plan.curves if curve.points or curve.left_out]
+    height, width = bench.size
+    scene = f"{study.name}, {len(bench.manager.train_dataset)} photos, {width} × {height}"
+    return Report(scene, facts(bench, options, seconds), curves, [*stopped, *left_out])
+
+
+def all_plans(bench: Workbench, options: TradeoffOptions) -> Tuple[List[Plan], List[str]]:
+    """What to measure, in order, and the groups that can't be, with the reason."""
+    asked = options.groups or tuple(GROUPS)
+    of_style = [group for group in ("fine-field", "style") if group in asked]
+    has_style = bench.targets is not None
+    reason = "there is no painting; name one with --style-image."
+    left_out = [] if has_style else [f"{GROUPS[group]}: {reason}" for group in of_style]
+    coarse, style = StageRuns(bench, is_style=False), StageRuns(bench, is_style=True)
+    plans: List[Plan] = []
+    if "training" in asked or bench.trains_coarse:
+        plans.append(coarse.long_plan())
+    if has_style and set(asked) != {"training"}:
+        plans.append(style.long_plan())
+    if "quadrature" in asked:
+        plans += quadrature_plans(bench)
+    if "rendering" in asked:
+        plans.append(baking_plan(bench))
+    if "precision" in asked:
+        plans.append(precision_plan(bench))
+    if "training" in asked:
+        plans.append(coarse.short_plan(["training"]))
+    if has_style and of_style:
+        plans.append(style.short_plan(of_style))
+    return plans, left_out
+
+
+def check_folder(folder: Path) -> None:
+    """Makes the folder of the report before anything is measured.
+
+    Raises:
+        InputError: it can't be written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise cant_write(folder, error) from error
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keeps nerfstudio's and the methods' lines and warnings from the terminal."""
+    consoles = (CONSOLE, rich.get_console())
+    before = [console.quiet for console in consoles]
+    for console in consoles:
+        console.quiet = True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for console, was in zip(consoles, before, strict=True):
+            console.quiet = was
+
+
+def facts(bench: Workbench, options: TradeoffOptions, seconds: float) -> Dict[str, Fact]:
+    """What figures depend on."""
+    backbone = None if bench.targets is None else bench.targets.backbone.description
+    return {
+        "device": device_name(bench.device),
+        "threads": str(torch.get_num_threads()),
+        "versions": versions(),
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "budget_seconds": seconds,
+        "spent_seconds": bench.budget.spent,
+        "presets": [bench.coarse_config.method_name, bench.style_config.method_name],
+        "coarse_run": "trained here" if options.coarse_run is None else str(options.coarse_run),
+        "style_image": "none" if options.style_image is None else options.style_image.name,
+        "feature_network": "none" if backbone is None else f"{backbone.name}, {backbone.source}",
+        "held_out_views": [str(view) for view in bench.views],
+    }

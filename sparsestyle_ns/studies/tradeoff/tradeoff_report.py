@@ -1,0 +1,168 @@
+"""The report: JSON, CSV, a page that opens offline, and a picture of all plots."""
+
+import csv
+import io
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Dict, List, Mapping, Sequence, Union
+
+from sparsestyle_ns.evaluation.tables import Table
+from sparsestyle_ns.studies.options import Group
+from sparsestyle_ns.studies.page import Section, study_page
+from sparsestyle_ns.studies.tradeoff.advice import recommendation
+from sparsestyle_ns.studies.tradeoff.curve_plots import curve_svg, overview_png
+from sparsestyle_ns.studies.tradeoff.curves import METRICS, Curve, Point
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import write_whole
+
+Fact = Union[str, float, Sequence[str], Mapping[str, str]]
+JSON_FILE, CSV_FILE, PAGE_FILE, PICTURE_FILE = "tradeoff.json", "tradeoff.csv", "index.html", "tradeoff.png"
+GROUPS: Dict[Group, str] = {
+    "training": "Training (stage 1)",
+    "quadrature": "Quadrature",
+    "fine-field": "Fine field (stage 2)",
+    "style": "Style (stage 2)",
+    "rendering": "Rendering",
+    "precision": "Precision",
+}
+"""In the order of the page."""
+COLUMNS = (
+    *("axis", "flag", "setting", "moment", "metric"),
+    *("median", "low", "high", "count", "front", "recommended", "busy"),
+)
+LEGEND = (
+    "Figures are medians, with the smallest and largest of as many repetitions as are named. A ring marks the "
+    "recommended point, the dashed line is the Pareto front: no other point is as fast and as accurate. Hollow points, "
+    "and rows with the word busy, were measured while other processes used more than a tenth of the cores; take their "
+    "times as upper ends."
+)
+
+
+@dataclass
+class Report:
+    """All that was found.
+
+    Attributes:
+        scene: what was measured, in words.
+        facts: of scene, machine and run, by their names.
+        curves: that have points or have left something out.
+        left_out: whole groups that weren't measured, and why.
+    """
+
+    scene: str
+    facts: Dict[str, Fact]
+    curves: List[Curve]
+    left_out: List[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.curves = sorted(self.curves, key=lambda curve: list(GROUPS).index(curve.group))
+
+    @property
+    def measured(self) -> List[Curve]:
+        """Those with points."""
+        return [curve for curve in self.curves if curve.points]
+
+    @property
+    def recommendation(self) -> List[str]:
+        """In plain words."""
+        return recommendation(self.measured)
+
+    def everything_left_out(self) -> List[str]:
+        """Groups and single values, each with its reason."""
+        return [*self.left_out, *(f"{curve.title}, {what}" for curve in self.curves for what in curve.left_out)]
+
+    def write(self, folder: Path) -> Path:
+        """Writes all files into a folder; returns the page.
+
+        Raises:
+            InputError: it can't be written to.
+        """
+        content = {
+            "scene": self.scene,
+            **self.facts,
+            "recommendation": self.recommendation,
+            "left_out": self.everything_left_out(),
+            "axes": [curve.content() for curve in self.curves],
+        }
+        try:
+            write_whole(folder / JSON_FILE, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
+            write_whole(folder / CSV_FILE, as_csv(self.curves))
+            if self.measured:
+                write_whole(folder / PICTURE_FILE, overview_png(self.measured))
+            page = study_page(f"What accuracy costs in time: {self.scene}", self.sections())
+            return write_whole(folder / PAGE_FILE, page)
+        except OSError as error:
+            raise cant_write(folder, error) from error
+
+    def sections(self) -> List[Section]:
+        """What the page shows."""
+        groups = {title: [curve for curve in self.measured if curve.group == name] for name, title in GROUPS.items()}
+        sections = [
+            Section(title, parts=list(map(curve_section, curves))) for title, curves in groups.items() if curves
+        ]
+        left_out = [Section("Left out", lines=self.everything_left_out())] if self.everything_left_out() else []
+        facts = {name.replace("_", " "): in_a_line(value) for name, value in self.facts.items()}
+        how = Section("How it was measured", LEGEND, facts=facts)
+        return [Section("In short", lines=self.recommendation), *sections, *left_out, how]
+
+
+def cant_write(folder: Path, error: OSError) -> InputError:
+    """What to say where a report can't be written."""
+    return InputError(f"The report can't be written to {folder} ({error.strerror}); name another --output-dir.")
+
+
+def as_csv(curves: Sequence[Curve]) -> str:
+    """All figures as CSV, one a row."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(COLUMNS)
+    for curve in curves:
+        front, recommended = curve.front, curve.recommended
+        for point in curve.points:
+            marks = [int(point in front), int(point is recommended), int(point.busy)]
+            for metric in point.values:
+                *numbers, count = point.spread(metric)
+                place = [curve.name, curve.flag, point.setting, point.moment, metric]
+                rows.writerow([*place, *(f"{number:.6g}" for number in numbers), count, *marks])
+    return text.getvalue()
+
+
+def in_a_line(fact: Fact) -> str:
+    """A fact in a line."""
+    if isinstance(fact, Mapping):
+        return ", ".join(f"{name} {item}" for name, item in fact.items())
+    if isinstance(fact, (int, float, str)):
+        return f"{fact:.3g}" if isinstance(fact, float) else str(fact)
+    return ", ".join(map(str, fact))
+
+
+def curve_section(curve: Curve) -> Section:
+    """What the page shows of a curve that has points."""
+    order = "" if curve.order is None else f" Observed order of convergence: {curve.order:.2f}."
+    plots = [
+        (curve_svg(curve, x, y), f"{METRICS[y].label} against {METRICS[x].label}")
+        for x, y in curve.plots
+        if any(x in point.values and y in point.values for point in curve.points)
+    ]
+    front, recommended = curve.front, curve.recommended
+
+    def row(point: Point) -> List[str]:
+        marks = {"recommended": point is recommended, "on the front": point in front, "busy": point.busy}
+        cells = [_cell(point, metric) for metric in curve.metrics]
+        return [*cells, ", ".join(mark for mark, holds in marks.items() if holds)]
+
+    columns = [*(METRICS[metric].label for metric in curve.metrics), ""]
+    table = Table(
+        f"{curve.flag}, preset: {curve.preset}", columns, [(point.name, row(point)) for point in curve.points]
+    )
+    return Section(curve.title, tables=[table], plots=plots, note=f"{curve.rule}{order} {curve.note}")
+
+
+def _cell(point: Point, metric: str) -> str:
+    if metric not in point.values:
+        return ""
+    spread = point.spread(metric)
+    if spread.count == 1:
+        return f"{spread.median:.4g}"
+    return f"{spread.median:.4g} ({spread.low:.3g} – {spread.high:.3g}, {spread.count}×)"
