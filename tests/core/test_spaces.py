@@ -5,7 +5,7 @@ import reference
 import torch
 from nerfstudio.data.scene_box import SceneBox
 
-from sparsestyle_ns.core.ndc import ndc_points, ndc_rays
+from sparsestyle_ns.core.ndc import ndc_rays
 from sparsestyle_ns.core.spaces import (
     MAX_DISTANCE,
     BoxSpace,
@@ -41,7 +41,7 @@ def forward_facing(scale=1.0):
     space = ForwardFacingSpace(SceneBox(aabb=box), FOCAL_OVER_HALF_SIZE, scale * NEAR)
 
     def to_field(points):
-        return (ndc_points(points, FOCAL_OVER_HALF_SIZE, scale * NEAR) - box[0]) / (box[1] - box[0]) * 2 - 1
+        return (reference.ndc_points(points, FOCAL_OVER_HALF_SIZE, scale * NEAR) - box[0]) / (box[1] - box[0]) * 2 - 1
 
     return space, scale * origins, directions, to_field
 
