@@ -259,8 +259,9 @@ class Workbench:
             figures = image_metrics(outputs["rgb"], self.photos[view])
             return {name: figures[name] for name in ("psnr", "ssim")}
         accumulation = None if model.background is None else outputs["accumulation"].squeeze(-1)
-        style, content = self.targets.losses(outputs["rgb"], self.targets.features(outputs["rgb_coarse"]), accumulation)
-        return {"style_loss": float(style), "content_loss": float(content)}
+        content = self.targets.features(outputs["rgb_coarse"])
+        losses = self.targets.losses(self.targets.view(outputs["rgb"], content, accumulation))
+        return {f"{name}_loss": float(value) for name, value in losses.items()}
 
     def seconds_to_evaluate(self, model: Model, views: Sequence[int]) -> float:
         """What `evaluate` will take, by what it took before."""
