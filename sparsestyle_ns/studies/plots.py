@@ -10,7 +10,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from sparsestyle_ns.studies.tradeoff.curves import METRICS, Curve, Point
+from sparsestyle_ns.studies.curves import METRICS, Curve, Point
 
 COLORS = ("#33617f", "#b4492b", "#6a8f3c", "#8a5a9e", "#b58a2a", "#3f8f8a")
 CHOSEN, FRONT, GRID = "#b4492b", "#9aa5ab", {"color": "#e4e1da", "lw": 0.6}

@@ -28,9 +28,9 @@ from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipe
 from sparsestyle_ns.pipelines.scene_views import SceneViews
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
 from sparsestyle_ns.runs.scene_record import record_scene
+from sparsestyle_ns.studies.pareto import root_mean_square
 from sparsestyle_ns.studies.study import Study
-from sparsestyle_ns.studies.tradeoff.pareto import root_mean_square
-from sparsestyle_ns.studies.tradeoff.time_budget import Budget, OutOfTimeError
+from sparsestyle_ns.studies.time_budget import Budget, OutOfTimeError
 from sparsestyle_ns.utils.machine import LoadWatch, synchronize
 
 Model = Union[CoarseFewShotModel, HierStyleModel]
