@@ -130,15 +130,7 @@ class HierStyleTrainer(SparseStyleTrainer):
             self._coarse_state = None
 
     def _coarse_run(self, manager: FewShotDataManager, decided: Decisions) -> CoarseRun:
-        """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now.
-
-        Args:
-            manager: the photos.
-            decided: what was decided about them.
-
-        Raises:
-            InputError: the run that was asked for doesn't exist or is of another scene.
-        """
+        """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now."""
         scene = record_scene(manager.config.data, manager.train_dataparser_outputs, decided)
         asked = self.config.pipeline.coarse_run
         if asked is not None:
@@ -185,7 +177,7 @@ class HierStyleTrainer(SparseStyleTrainer):
         return read_coarse_run(trainer.base_dir)
 
     def next_command(self) -> List[str]:
-        """See `SparseStyleTrainer.next_command`."""
+        """Looking at it."""
         return ["sparsestyle", "gallery", str(self.base_dir)]
 
 

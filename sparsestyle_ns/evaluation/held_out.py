@@ -61,11 +61,7 @@ class HeldOutReport:
         return {"num_rays_per_sec": statistics.fmean(rates), "fps": fps}
 
     def save(self, path: Path, experiment: str, method: str, step: int) -> None:
-        """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means.
-
-        Raises:
-            OSError: it can't be written.
-        """
+        """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means."""
         run = {"experiment_name": experiment, "method_name": method, "step": step}
         write_whole(path, json.dumps({**run, "results": self.means, "views": self.views}, indent=2) + "\n")
 
@@ -191,7 +187,7 @@ def stylisation_figures(
         losses = targets.losses(view)
         figures.update({f"{name}_loss{suffix}": float(value) for name, value in losses.items()})
         figures[f"gram_distance{suffix}"] = float(gram_distance(gram_matrix(view.features), style_gram))
-    del figures["content_loss_before"]
+    figures.pop("content_loss_before", None)
     return figures
 
 
