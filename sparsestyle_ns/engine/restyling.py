@@ -23,7 +23,7 @@ from sparsestyle_ns.engine.style_trainer import style_notes
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.engine.training import check_skipped, training_step, warm_start
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleInputs, StyleTask
-from sparsestyle_ns.runs.checkpoints import checkpoint_path, write_checkpoint
+from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path, write_checkpoint
 from sparsestyle_ns.runs.run_folder import read_config
 from sparsestyle_ns.runs.scene_record import FILE_NAME as SCENE_RECORD
 from sparsestyle_ns.runs.thumbnail import save_thumbnail
@@ -195,8 +195,7 @@ class Restyling:
         own = {f"_model.residual.{name}": value for name, value in self.field.state_dict().items()}
         step = self.iterations - 1
         path = checkpoint_path(new / self.config.relative_model_dir, step)
-        notes = style_notes(self.pipeline, self.effects, asdict(self.workshop.backbone().description))
-        write_checkpoint(path, step, {**self.pipeline.state_dict(), **own}, self.optimizers, notes)
+        write_checkpoint(path, step, {**self.pipeline.state_dict(), **own}, self.optimizers, self.notes())
 
     def _write_config(self, new: Path, folder: Path) -> None:
         """Writes the config of a run that will lie in `folder`."""
@@ -205,3 +204,7 @@ class Restyling:
         config.load_dir = config.load_step = config.load_checkpoint = None
         config.pipeline.style_image, config.pipeline.decided = folder / self._painting, self.effects
         write_whole(new / "config.yml", yaml.dump(config))
+
+    def notes(self) -> CheckpointNotes:
+        """What its checkpoint says beside the state."""
+        return style_notes(self.pipeline, self.effects, asdict(self.workshop.backbone().description))
