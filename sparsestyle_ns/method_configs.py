@@ -9,9 +9,8 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig, MultiS
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from sparsestyle_ns.engine.coarse_trainer import CoarseFewShotTrainer
 from sparsestyle_ns.engine.style_trainer import HierStyleTrainer
-from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
+from sparsestyle_ns.engine.trainer import CoarseFewShotTrainer, SparseStyleTrainerConfig
 from sparsestyle_ns.engine.training import FusedAdamConfig
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
