@@ -40,13 +40,7 @@ RUN_SETTINGS = ("data", "output_dir", "experiment_name", "project_name", "machin
 
 
 def style_notes(pipeline: HierStylePipeline, effects: Decisions, backbone: Dict[str, str]) -> CheckpointNotes:
-    """The notes of a stylised checkpoint.
-
-    Args:
-        pipeline: of the scene.
-        effects: that the style is made with.
-        backbone: name, source and sha256 of the feature network.
-    """
+    """The notes of a checkpoint of a scene in a style that is made with these effects and this network."""
     return {
         "effects": effects.records(),
         "backbone": backbone,

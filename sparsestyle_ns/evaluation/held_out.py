@@ -148,8 +148,8 @@ class _StyleMeasure:
         values = {f"coarse_{key}": value for key, value in image_metrics(coarse, photo).items()}
         values["content_ssim"] = image_metrics(stylised, photo)["ssim"]
         if self.targets is not None:
-            accumulation = None if model.background is None else outputs["accumulation"].squeeze(-1)
-            values.update(stylisation_figures(self.targets, self.style_gram, coarse, stylised, accumulation))
+            covered = None if model.background is None else outputs["accumulation"].squeeze(-1)
+            values.update(stylisation_figures(self.targets, self.style_gram, coarse, stylised, covered))
         if self.art_fid is not None:
             self.art_fid.add(stylised, photo)
         if self.baked:
