@@ -118,7 +118,7 @@ class HierStyleTrainer(SparseStyleTrainer):
 
     def _load_checkpoint(self) -> None:
         super()._load_checkpoint()
-        self.pipeline.style_inputs = self._style
+        self.pipeline.targets = self.pipeline.config.targets_of(self._style, self.pipeline.device)
         if self._coarse_state is not None:
             self.pipeline.model.adopt_coarse(self._coarse_state)
             self._coarse_state = None

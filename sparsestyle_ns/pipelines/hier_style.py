@@ -115,9 +115,8 @@ class HierStylePipeline(CheckedPipeline):
 
     config: HierStylePipelineConfig
     model: HierStyleModel
-    style_inputs: Optional[StyleInputs] = None
-    """The painting and the network, where whoever trains has read them already."""
     targets: Optional[StyleTargets] = None
+    """The painting; given before training is set up by whoever has read it already."""
     scene_views: Optional[SceneViews] = None
     task: Optional[StyleTask] = None
     """What this run trains, once it is set up."""
@@ -142,7 +141,7 @@ class HierStylePipeline(CheckedPipeline):
     ) -> List[TrainingCallback]:
         """Prepares the style and the views, as far as they aren't there already."""
         if self.targets is None:
-            self.targets = self.config.targets_of(self.style_inputs or self.config.load_style(), self.device)
+            self.targets = self.config.targets_of(self.config.load_style(), self.device)
         self.announce(self.targets.backbone)
         self.task = self.new_task(self.model.residual, self.targets, self.effects)
         say(self.scene_views.report())
