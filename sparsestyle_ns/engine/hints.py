@@ -10,8 +10,8 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
 from sparsestyle_ns.effects.base import EffectSettings
-from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.runs.coarse_run import read_coarse_run
+from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD
 from sparsestyle_ns.utils.progress import say
 
 PAINTING = "PAINTING.jpg"
@@ -21,25 +21,14 @@ RESUMING = ("--load-dir", "--load-checkpoint", "--load-step")
 
 
 def finish(made: Union[Path, str, None], command: Sequence[object]) -> None:
-    """Prints the last line of a command.
-
-    Args:
-        made: the file or folder that it made, with a word on it where that helps; None: nothing.
-        command: what to type next, in parts.
-    """
+    """Prints a command's last line: the file or folder that it made, with a word on it, and what to type next."""
     say(f"{'Nothing was saved' if made is None else f'Made {made}'} – next: {shlex.join(map(str, command))}")
 
 
-def ns_train_style(coarse_run: Path, config: TrainerConfig, painting: Union[Path, str] = PAINTING) -> List[str]:
-    """The command that stylises a coarse run.
-
-    Args:
-        coarse_run: its folder.
-        config: its trainer's config.
-        painting: the style image.
-    """
-    method = config.method_name.replace("coarse-fewshot", "hier-style")
-    start = ["ns-train", method, "--style-image", str(painting), "--coarse-run", str(coarse_run)]
+def ns_train_style(coarse_run: Path, config: TrainerConfig) -> List[str]:
+    """The command that stylises a coarse run, given by its folder and what is in its config.yml."""
+    method = config.method_name.replace(COARSE_METHOD, STYLE_METHOD)
+    start = ["ns-train", method, "--style-image", PAINTING, "--coarse-run", str(coarse_run)]
     return [*start, *scene_arguments(config)]
 
 
@@ -57,11 +46,11 @@ def after_effects(
     style_image: Optional[Path],
 ) -> List[str]:
     """What follows on `sparsestyle effects`, from its arguments."""
-    command = ["ns-train", "coarse-fewshot"]
+    command = ["ns-train", COARSE_METHOD]
     if coarse_run is not None:
-        painting = PAINTING if style_image is None else str(style_image)
-        command = ["ns-train", "hier-style", "--style-image", painting, "--coarse-run", str(coarse_run)]
-    command += _flag("--num-views", num_views, None) + _flag("--view-ids", view_ids, None)
+        command = ["ns-train", STYLE_METHOD, "--style-image", str(style_image or PAINTING)]
+        command += ["--coarse-run", str(coarse_run)]
+    command += _flag("--num-views", num_views) + _flag("--view-ids", view_ids)
     return [*command, "--data", str(data), *_parser(dataparser)]
 
 
@@ -73,17 +62,11 @@ def after_export(run: Path, output_path: Path, format: str) -> List[object]:
 
 
 def scene_arguments(config: TrainerConfig) -> List[str]:
-    """The end of an ns-train command on the same scene, with the same views, size and effects.
-
-    Args:
-        config: of a run of either method.
-    """
-    manager, usual = config.pipeline.datamanager, FewShotDataManagerConfig()
-    arguments: List[str] = []
-    for name in ("num_views", "view_ids"):
-        arguments += _flag(f"--{name}", getattr(manager, name), getattr(usual, name))
+    """The end of an ns-train command on the same scene as a run, with the same views, size and effects."""
+    manager = config.pipeline.datamanager
+    arguments = _flag("--num-views", manager.num_views) + _flag("--view-ids", manager.view_ids)
     arguments += _flag("--max-image-side", manager.max_image_side)  # methods differ in what they do without it
-    arguments += changed_flags(config.pipeline.effects, EffectSettings(), "pipeline.effects.")
+    arguments += _changed_flags(config.pipeline.effects, EffectSettings(), "pipeline.effects.")
     arguments += _flag("--output-dir", config.output_dir, Path("outputs"))
     arguments += _flag("--vis", config.vis, "viewer+tensorboard")
     return [*arguments, "--data", str(manager.data or manager.dataparser.data), *_parser(manager.dataparser)]
@@ -94,10 +77,10 @@ def _parser(config: Any) -> List[str]:
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 
     name = next(name for name, known in all_dataparsers.items() if type(known) is type(config))
-    return [name, *changed_flags(config, all_dataparsers[name])]
+    return [name, *_changed_flags(config, all_dataparsers[name])]
 
 
-def changed_flags(config: Any, default: Any, prefix: str = "") -> List[str]:
+def _changed_flags(config: Any, default: Any, prefix: str = "") -> List[str]:
     """The flags by which a config differs from a default of the same class; its `data` is named elsewhere."""
     flags: List[str] = []
     for each in fields(config):
@@ -115,12 +98,10 @@ def _flag(name: str, value: Any, usual: Any = None) -> List[str]:
 
 
 def resume_command(method: str, checkpoints: Path, typed: Optional[Sequence[str]] = None) -> List[str]:
-    """The command that was typed, going on from the checkpoints in a folder.
+    """The command that was typed to train a method, going on from a folder of checkpoints.
 
     Args:
-        method: what was trained.
-        checkpoints: the folder.
-        typed: the arguments of this process; None: its own.
+        typed: its arguments; None: this process's own.
     """
     typed = sys.argv[1:] if typed is None else list(typed)
     if method not in typed:  # training was begun by something else than ns-train

@@ -12,13 +12,7 @@ from sparsestyle_ns.utils.errors import InputError
 
 
 class LoadedRun(NamedTuple):
-    """A run, ready to render.
-
-    Attributes:
-        config: its settings.
-        pipeline: with the newest checkpoint loaded, in evaluation.
-        step: that checkpoint's iteration.
-    """
+    """A run, ready to render, with the newest checkpoint, which is of iteration `step`."""
 
     config: SparseStyleTrainerConfig
     pipeline: CheckedPipeline
@@ -26,10 +20,7 @@ class LoadedRun(NamedTuple):
 
 
 def load_run(config_path: Path) -> LoadedRun:
-    """Loads a run, which may have been moved since it was made.
-
-    Args:
-        config_path: its config.yml.
+    """Loads a run by its config.yml; it may have been moved since it was made.
 
     Raises:
         InputError: the run has no checkpoint.
@@ -58,14 +49,7 @@ def load_run(config_path: Path) -> LoadedRun:
 def evaluate_run(
     config_path: Path, output_path: Path, style_image: Optional[Path] = None, baked: bool = False
 ) -> HeldOutReport:
-    """Loads a run, evaluates it, and writes the report.
-
-    Args:
-        config_path: the run's config.yml.
-        output_path: JSON file to write.
-        style_image: painting to measure against; None for the one the run was made with. Where that file is gone, the
-            style losses are left out.
-        baked: whether to measure a stylised run's baked renders as well.
+    """Loads a run by its config.yml, evaluates it (see `CheckedPipeline.held_out_report`), and writes the report.
 
     Raises:
         InputError: the run has no checkpoint.

@@ -74,11 +74,7 @@ class Workshop:
         self._backbone: Optional[Backbone] = None
 
     def config(self) -> SparseStyleTrainerConfig:
-        """The run's config, with the optimiser, the schedule and the number of iterations.
-
-        Raises:
-            InputError: it isn't there or can't be read.
-        """
+        """The run's config, as it is by now; see `read_config`."""
         return read_config(self.folder)
 
     def backbone(self) -> Backbone:
@@ -98,18 +94,12 @@ class Workshop:
 
 
 class Restyling:
-    """One restyling, in steps: `for progress in restyling: …`, then `field` is the new style.
+    """One restyling, in steps: `for progress in restyling: …`, then `field` (σ_f and c_f) is the new style.
 
     Args:
         workshop: of the scene.
         image: the painting.
-        iterations: how many; None: as many as the run had.
-
-    Attributes:
-        field: σ_f and c_f; final once the iterator has ended.
-
-    Raises:
-        InputError: there are fewer iterations than one.
+        iterations: how many, at least 1; None: as many as the run had.
     """
 
     def __init__(self, workshop: Workshop, image: Painting, iterations: Optional[int] = None) -> None:
@@ -156,12 +146,9 @@ class Restyling:
         return {name: float(value) for name, value in metrics.items()}
 
     def save(self) -> Path:
-        """Saves the style as a run of its own beside the one in the viewer, for ns-render, ns-viewer and the rest.
+        """Saves the style as a run of its own beside the one in the viewer; returns its folder.
 
         The run is there as a whole or not at all: it is made in a hidden folder, which goes when something fails.
-
-        Returns:
-            The new run's folder.
 
         Raises:
             OSError, RuntimeError: it can't be written; torch's writer makes the second of some of the first.

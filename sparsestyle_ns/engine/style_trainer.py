@@ -40,13 +40,7 @@ RUN_SETTINGS = ("data", "output_dir", "experiment_name", "project_name", "machin
 
 
 def style_notes(pipeline: HierStylePipeline, effects: Decisions, backbone: Dict[str, str]) -> CheckpointNotes:
-    """The notes of a stylised checkpoint.
-
-    Args:
-        pipeline: of the scene.
-        effects: that the style is made with.
-        backbone: name, source and sha256 of the feature network.
-    """
+    """The notes of a checkpoint of a scene in a style that is made with these effects and this network."""
     return {
         "effects": effects.records(),
         "backbone": backbone,
@@ -124,21 +118,13 @@ class HierStyleTrainer(SparseStyleTrainer):
 
     def _load_checkpoint(self) -> None:
         super()._load_checkpoint()
-        self.pipeline.style_inputs = self._style
+        self.pipeline.targets = self.pipeline.config.targets_of(self._style, self.pipeline.device)
         if self._coarse_state is not None:
             self.pipeline.model.adopt_coarse(self._coarse_state)
             self._coarse_state = None
 
     def _coarse_run(self, manager: FewShotDataManager, decided: Decisions) -> CoarseRun:
-        """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now.
-
-        Args:
-            manager: the photos.
-            decided: what was decided about them.
-
-        Raises:
-            InputError: the run that was asked for doesn't exist or is of another scene.
-        """
+        """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now."""
         scene = record_scene(manager.config.data, manager.train_dataparser_outputs, decided)
         asked = self.config.pipeline.coarse_run
         if asked is not None:
@@ -185,7 +171,7 @@ class HierStyleTrainer(SparseStyleTrainer):
         return read_coarse_run(trainer.base_dir)
 
     def next_command(self) -> List[str]:
-        """See `SparseStyleTrainer.next_command`."""
+        """Looking at it."""
         return ["sparsestyle", "gallery", str(self.base_dir)]
 
 

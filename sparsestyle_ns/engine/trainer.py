@@ -15,7 +15,7 @@ import yaml
 from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.utils import writer
+from nerfstudio.utils import comms, writer
 from nerfstudio.utils.decorators import check_main_thread, check_viewer_enabled
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
@@ -113,19 +113,16 @@ class SparseStyleTrainer(Trainer, ABC):
             decided.check_choices(self.config.pipeline.effects, f"the checkpoint {self._resumed_checkpoint()}")
             self.config.pipeline.decided = decided
         super().setup(test_mode)
-        self._save_record()
+        if comms.is_main_process():
+            manager, effects = self.pipeline.datamanager, self.pipeline.effects
+            record_scene(manager.config.data, manager.train_dataparser_outputs, effects).save(self.base_dir)
+            self._save_decisions()
 
     def setup_optimizers(self) -> Optimizers:
         """Optimisers that skip steps whose gradient isn't finite."""
         return FiniteOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
 
-    @check_main_thread
-    def _save_record(self) -> None:
-        manager = self.pipeline.datamanager
-        record_scene(manager.config.data, manager.train_dataparser_outputs, self.pipeline.effects).save(self.base_dir)
-        self.save_decisions()
-
-    def save_decisions(self) -> None:
+    def _save_decisions(self) -> None:
         """Writes which effects are simulated into effects.json, and into config.yml, from which a run is loaded."""
         self.pipeline.effects.save(self.base_dir)
         self._saved_decisions = self.pipeline.effects
@@ -133,11 +130,7 @@ class SparseStyleTrainer(Trainer, ABC):
 
     @functools.cached_property
     def resumed(self) -> Optional[Dict[str, Any]]:
-        """What is in the checkpoint that training goes on from, until it is loaded; None for a new run.
-
-        Raises:
-            InputError: there is none where the command line says, or it can't be read.
-        """
+        """What is in the checkpoint that training goes on from, until it is loaded; None for a new run."""
         checkpoint = self._resumed_checkpoint()
         return None if checkpoint is None else load_checkpoint(checkpoint)
 
@@ -180,9 +173,6 @@ class SparseStyleTrainer(Trainer, ABC):
         """Trains up to `max_num_iterations`, counted from the very first iteration, also when resuming.
 
         Ctrl-C ends training after the iteration that is under way and saves a checkpoint; a second one stops at once.
-
-        Raises:
-            InputError: the checkpoint that training goes on from has all its iterations already.
         """
         total = self.config.max_num_iterations
         if self._start_step >= total:
@@ -193,9 +183,9 @@ class SparseStyleTrainer(Trainer, ABC):
         self._interrupted = False
         former = signal.signal(signal.SIGINT, self._on_interrupt)
         has_table = self.config.logging.local_writer.enable  # nerfstudio's, which would write over the bar
+        shown = bar(self.stage, total, self._start_step, "iterations", visible=not has_table)
         try:
             with ExitStack() as self._bars:
-                shown = bar(self.stage, total, self._start_step, "iterations", visible=not has_table)
                 self._bar = self._bars.enter_context(shown)
                 super().train()
         except TrainingInterruptedError:
@@ -227,19 +217,14 @@ class SparseStyleTrainer(Trainer, ABC):
         CONSOLE.print("Ctrl-C: finishing this iteration, then saving. Press it again to stop at once.")
 
     def train_iteration(self, step: int) -> Tuple[Tensor, Dict[str, Tensor], Dict[str, Tensor]]:
-        """One iteration: its loss, the losses by name, and metrics.
-
-        Raises:
-            InputError: the gradients of too many iterations in a row weren't finite.
-        """
+        """One iteration: its loss, the losses by name, and metrics."""
         losses: Dict[str, Tensor] = {}
         metrics: Dict[str, Tensor] = {}
 
         def compute_losses(step: int) -> Dict[str, Tensor]:
+            nonlocal losses, metrics
             with torch.autocast(self.pipeline.device.type, enabled=self.mixed_precision):
-                _, of_step, metrics_of_step = self.pipeline.get_train_loss_dict(step)
-            losses.update(of_step)
-            metrics.update(metrics_of_step)
+                _, losses, metrics = self.pipeline.get_train_loss_dict(step)
             return losses
 
         accumulate = self.gradient_accumulation_steps
@@ -279,11 +264,7 @@ class SparseStyleTrainer(Trainer, ABC):
         return check_skipped(self.optimizers, self.config.max_skipped_steps, step, advice)
 
     def eval_iteration(self, step: int) -> None:
-        """What nerfstudio evaluates after an iteration, and the preview after some; then it is over.
-
-        Raises:
-            TrainingInterruptedError: Ctrl-C was pressed, in any process.
-        """
+        """What nerfstudio evaluates after an iteration, and the preview after some; then Ctrl-C ends training."""
         if step + 1 in self._preview_steps:
             self._write_preview(step + 1)
         super().eval_iteration(step)
@@ -320,18 +301,15 @@ class SparseStyleTrainer(Trainer, ABC):
 
         While steps are being skipped, the state is under suspicion: nothing is saved then, and at the end of training
         the former checkpoint is kept beside the last.
-
-        Raises:
-            InputError: there is a number in it that isn't finite, or the disk is full or can't be written to.
         """
         suspect = self._look_at_skipped(step) > 0
         if suspect and not self._interrupted and step + 1 < self.config.max_num_iterations:
             CONSOLE.print(f"No checkpoint of iteration {step + 1}: its step was skipped.")
             return
         target, unfinished = checkpoint_path(self.checkpoint_dir, step), self.base_dir / "checkpoint.unfinished"
-        state, notes = self.pipeline.state_dict(), self.notes()
+        content = step, self.pipeline.state_dict(), self.optimizers, self.notes(), self.grad_scaler
         try:
-            write_checkpoint(target, step, state, self.optimizers, notes, self.grad_scaler, unfinished)
+            write_checkpoint(target, *content, unfinished)
         except (OSError, RuntimeError) as error:  # torch's writer makes a RuntimeError of some OSErrors
             unfinished.unlink(missing_ok=True)
             raise InputError(
@@ -344,7 +322,7 @@ class SparseStyleTrainer(Trainer, ABC):
                 if path != target:
                     path.unlink()
         if self.pipeline.effects != self._saved_decisions:
-            self.save_decisions()
+            self._save_decisions()
 
 
 class CoarseFewShotTrainer(SparseStyleTrainer):
@@ -354,12 +332,12 @@ class CoarseFewShotTrainer(SparseStyleTrainer):
     pipeline: CoarseFewShotPipeline
 
     def notes(self) -> CheckpointNotes:
-        """What `SparseStyleTrainer.notes` has and, where a feature network took part, which."""
+        """The effects and, where a feature network took part, which."""
         unseen = self.pipeline.unseen
         return {**super().notes(), **({} if unseen is None else {"backbone": asdict(unseen.backbone.description)})}
 
     def next_command(self) -> List[str]:
-        """See `SparseStyleTrainer.next_command`."""
+        """Stylising it."""
         return ns_train_style(self.base_dir, self.config)
 
 

@@ -61,11 +61,7 @@ class HeldOutReport:
         return {"num_rays_per_sec": statistics.fmean(rates), "fps": fps}
 
     def save(self, path: Path, experiment: str, method: str, step: int) -> None:
-        """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means.
-
-        Raises:
-            OSError: it can't be written.
-        """
+        """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means."""
         run = {"experiment_name": experiment, "method_name": method, "step": step}
         write_whole(path, json.dumps({**run, "results": self.means, "views": self.views}, indent=2) + "\n")
 
@@ -152,8 +148,8 @@ class _StyleMeasure:
         values = {f"coarse_{key}": value for key, value in image_metrics(coarse, photo).items()}
         values["content_ssim"] = image_metrics(stylised, photo)["ssim"]
         if self.targets is not None:
-            accumulation = None if model.background is None else outputs["accumulation"].squeeze(-1)
-            values.update(stylisation_figures(self.targets, self.style_gram, coarse, stylised, accumulation))
+            covered = None if model.background is None else outputs["accumulation"].squeeze(-1)
+            values.update(stylisation_figures(self.targets, self.style_gram, coarse, stylised, covered))
         if self.art_fid is not None:
             self.art_fid.add(stylised, photo)
         if self.baked:
@@ -191,7 +187,7 @@ def stylisation_figures(
         losses = targets.losses(view)
         figures.update({f"{name}_loss{suffix}": float(value) for name, value in losses.items()})
         figures[f"gram_distance{suffix}"] = float(gram_distance(gram_matrix(view.features), style_gram))
-    del figures["content_loss_before"]
+    figures.pop("content_loss_before", None)
     return figures
 
 

@@ -16,13 +16,7 @@ from sparsestyle_ns.utils.progress import track
 
 @dataclass
 class PathFrames:
-    """Frames of the measuring path, on the CPU.
-
-    Attributes:
-        stylised: the stylised renders.
-        coarse: the unstylised renders.
-        surfaces: what they show of the unstylised scene.
-    """
+    """Frames of the measuring path, and what they show of the unstylised scene; on the CPU."""
 
     stylised: List[Float[Tensor, "H W 3"]]
     coarse: List[Float[Tensor, "H W 3"]]
@@ -54,14 +48,10 @@ def render_path(model: HierStyleModel, cameras: Cameras) -> PathFrames:
             outputs = model.get_outputs_for_camera(camera)
         rays = camera.generate_rays(camera_indices=0, keep_shape=True)
         points = rays.origins + outputs["depth_coarse"] * rays.directions
-        pinhole = Pinhole(
-            camera.camera_to_worlds[0].cpu(),
-            (float(camera.fx), float(camera.fy)),
-            (float(camera.cx), float(camera.cy)),
-        )
+        focal, center = (float(camera.fx), float(camera.fy)), (float(camera.cx), float(camera.cy))
+        pinhole = Pinhole(camera.camera_to_worlds[0].cpu(), focal, center)
+        covered = (outputs["accumulation_coarse"] > MIN_COVERAGE).squeeze(-1)
         frames.stylised.append(outputs["rgb"].clamp(0.0, 1.0).cpu())
         frames.coarse.append(outputs["rgb_coarse"].clamp(0.0, 1.0).cpu())
-        frames.surfaces.append(
-            Surface(pinhole, points.cpu(), (outputs["accumulation_coarse"] > MIN_COVERAGE).squeeze(-1).cpu())
-        )
+        frames.surfaces.append(Surface(pinhole, points.cpu(), covered.cpu()))
     return frames

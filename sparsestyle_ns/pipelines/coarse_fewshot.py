@@ -31,17 +31,6 @@ class CoarseFewShotPipelineConfig(CheckedPipelineConfig):
     semantic_side: int = 64
     """Longer side, in pixels, of the views rendered for it; all their rays are in memory at once."""
 
-    def check_semantic(self) -> None:
-        """Makes sure that the semantic loss can be had with these settings.
-
-        Raises:
-            InputError: a setting is out of its range.
-        """
-        if not 0.0 <= self.semantic_weight < float("inf"):
-            raise InputError(f"--pipeline.semantic-weight is {self.semantic_weight}; give a number from 0 on.")
-        if self.semantic_every < 1:
-            raise InputError(f"--pipeline.semantic-every is {self.semantic_every}; give 1 or more.")
-
 
 class CoarseFewShotPipeline(CheckedPipeline):
     """Stage 1. nerfstudio's own steps on our data manager and model."""
@@ -54,22 +43,26 @@ class CoarseFewShotPipeline(CheckedPipeline):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> List[TrainingCallback]:
-        """Adds the decision about empty space to nerfstudio's callbacks, and prepares the semantic loss."""
-        self.config.check_semantic()
-        if self.config.semantic_weight > 0:
-            self.unseen = self.unseen_views()
+        """Adds the decision about empty space to nerfstudio's callbacks, and prepares the semantic loss.
+
+        Raises:
+            InputError: there can be no semantic loss with these settings, these photos or these weights.
+        """
+        weight, every = self.config.semantic_weight, self.config.semantic_every
+        if not 0.0 <= weight < float("inf"):
+            raise InputError(f"--pipeline.semantic-weight is {weight}; give a number from 0 on.")
+        if every < 1:
+            raise InputError(f"--pipeline.semantic-every is {every}; give 1 or more.")
+        if weight > 0:
+            self.unseen = self._unseen_views()
         callbacks = super().get_training_callbacks(training_callback_attributes)
         if self.effects["empty_space"].choice == "auto":
             where = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
             callbacks.append(TrainingCallback(where_to_run=where, func=self.decide_empty_space))
         return callbacks
 
-    def unseen_views(self) -> UnseenViews:
-        """The views between the photos, with the feature network, which is announced.
-
-        Raises:
-            InputError: there is one photo only, or no network.
-        """
+    def _unseen_views(self) -> UnseenViews:
+        """The views between the photos, with the feature network, which is announced."""
         cameras, pixels = self.datamanager.train_dataset.cameras, self.datamanager.pixels
         if len(cameras) < 2:
             raise InputError("--pipeline.semantic-weight needs views between photos, and there is one; train on more.")
@@ -82,12 +75,10 @@ class CoarseFewShotPipeline(CheckedPipeline):
         return UnseenViews(backbone, cameras, photos, side)
 
     def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Any], Dict[str, Tensor], Dict[str, Any]]:
-        """Outputs, losses and metrics of a batch and, every `semantic_every` iterations, the loss of an unseen view.
-
-        Which view and which photo depends on the data manager's seed and the step alone.
-        """
+        """Outputs, losses and metrics of a batch and, every `semantic_every` iterations, the loss of an unseen view."""
         outputs, losses, metrics = super().get_train_loss_dict(step)
         if self.unseen is not None and step % self.config.semantic_every == 0:
+            # Which view and which photo depends on the data manager's seed and the step alone.
             generator = torch.Generator().manual_seed(self.datamanager.config.seed * 1_000_003 + step)
             losses["semantic_loss"] = self.config.semantic_weight * self.unseen.loss(self.model, generator)
         return outputs, losses, metrics

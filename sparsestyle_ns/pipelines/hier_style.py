@@ -72,12 +72,6 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         Raises:
             InputError: there is no style image or no weights, or they can't be read, or a setting is out of its range.
         """
-        self._check()
-        if self.style_image is None:
-            raise InputError("There is no style image: name a painting with --style-image FILE.")
-        return StyleInputs(Painting.read(self.style_image), self.load_backbone(torch.device("cpu")))
-
-    def _check(self) -> None:
         if self.style_features is not None and self.style_features < 1:
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
         for name, weight in self.loss_weights.items():
@@ -89,6 +83,9 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
                 raise InputError(f"--pipeline.loss-weights.{name} is {weight}; give a finite number, 0 or more.")
         if not any(self.loss_weights.values()):
             raise InputError("--pipeline.loss-weights turns every loss off; give one of them a weight above 0.")
+        if self.style_image is None:
+            raise InputError("There is no style image: name a painting with --style-image FILE.")
+        return StyleInputs(Painting.read(self.style_image), self.load_backbone(torch.device("cpu")))
 
     def targets_of(self, style: StyleInputs, device: torch.device) -> StyleTargets:
         """A painting as the feature network sees it, with these settings; the network moves to the device."""
@@ -118,9 +115,8 @@ class HierStylePipeline(CheckedPipeline):
 
     config: HierStylePipelineConfig
     model: HierStyleModel
-    style_inputs: Optional[StyleInputs] = None
-    """The painting and the network, where whoever trains has read them already."""
     targets: Optional[StyleTargets] = None
+    """The painting; given before training is set up by whoever has read it already."""
     scene_views: Optional[SceneViews] = None
     task: Optional[StyleTask] = None
     """What this run trains, once it is set up."""
@@ -145,14 +141,14 @@ class HierStylePipeline(CheckedPipeline):
     ) -> List[TrainingCallback]:
         """Prepares the style and the views, as far as they aren't there already."""
         if self.targets is None:
-            self.targets = self.config.targets_of(self.style_inputs or self.config.load_style(), self.device)
+            self.targets = self.config.targets_of(self.config.load_style(), self.device)
         self.announce(self.targets.backbone)
         self.task = self.new_task(self.model.residual, self.targets, self.effects)
         say(self.scene_views.report())
         return super().get_training_callbacks(training_callback_attributes)
 
     def style_targets(self, style_image: Optional[Path] = None) -> Optional[StyleTargets]:
-        """See `CheckedPipeline.style_targets`."""
+        """The painting to measure against, where it is still there; another one than the run's where that is given."""
         if self.targets is not None and style_image is None:
             return self.targets
         path = style_image or self.config.style_image
@@ -162,12 +158,10 @@ class HierStylePipeline(CheckedPipeline):
         return self.config.targets_of(replace(self.config, style_image=path).load_style(), self.device)
 
     def warm_start_loss(self, task: StyleTask, step: int) -> Dict[str, Float[Tensor, ""]]:
-        """How far c_f, on the coarse geometry, is from the content picture of one photo.
+        """How far c_f, on the coarse geometry, is from the content picture of one photo; not in the paper.
 
-        A coarse field that is fine-tuned itself is fitted as a whole: its colours can't change with its geometry held.
-
-        The features of VGG's third block hardly see colour; stylising from grey loses the palette. The paper doesn't do
-        this.
+        The features of VGG's third block hardly see colour; stylising from grey loses the palette. A coarse field that
+        is fine-tuned itself is fitted as a whole: its colours can't change with its geometry held.
         """
         view = task.views[step % self.scene_views.num_photos]
         coarse_geometry = self.model.config.stylised_field == "residual"

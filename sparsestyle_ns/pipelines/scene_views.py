@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import List, Optional
+from typing import Iterator, List, Optional, Tuple
 
 import psutil
 import torch
@@ -98,32 +98,26 @@ class SceneViews:
     @torch.no_grad()
     def for_painting(self, targets: StyleTargets, effects: Decisions) -> List[ContentView]:
         """The views with what they must stay like for one painting."""
+        views = self.views
         if effects.on("palette"):
-            views = [
-                replace(view, picture=picture, features=targets.features(picture))
-                for view, picture in zip(self.views, self._in_style_colors(targets), strict=True)
-            ]
-        else:
-            views = self.views
-            for view in views:
-                if view.features is None:  # the same for every painting
-                    view.features = targets.features(view.picture)
+            views = [replace(view, picture=picture, features=None) for view, picture in self._in_style_colors(targets)]
+        for view in views:
+            if view.features is None:  # those of a view's own picture are the same for every painting
+                view.features = targets.features(view.picture)
         return views if self.model.background is not None else [replace(view, accumulation=None) for view in views]
 
-    def _in_style_colors(self, targets: StyleTargets) -> List[Tensor]:
-        """Pictures with the painting's colours; where the scene is transparent the background stays as it is."""
+    def _in_style_colors(self, targets: StyleTargets) -> Iterator[Tuple[ContentView, Tensor]]:
+        """Views, and their pictures in the painting's colours; where the scene is transparent, the background stays."""
         photos = self.views[: self.num_photos]
         colors = torch.cat([view.picture.reshape(-1, 3) for view in photos])
         weight = torch.cat([view.accumulation.reshape(-1) for view in photos])
         style = color_moments(targets.style_image.permute(1, 2, 0).reshape(-1, 3))
         matrix, offset = palette_transform(*color_moments(colors, weight), *style)
-        transferred = [apply_palette(view.picture, matrix, offset, clamp=True) for view in self.views]
-        if self.model.background is None:
-            return transferred
-        return [
-            torch.lerp(view.picture, changed, view.accumulation[..., None].clamp(0.0, 1.0))
-            for view, changed in zip(self.views, transferred, strict=True)
-        ]
+        for view in self.views:
+            picture = apply_palette(view.picture, matrix, offset, clamp=True)
+            if self.model.background is not None:
+                picture = torch.lerp(view.picture, picture, view.accumulation[..., None].clamp(0.0, 1.0))
+            yield view, picture
 
     def render(self, view: ContentView, style: nn.Module, coarse_geometry: bool = False) -> Float[Tensor, "H W 3"]:
         """The stylised picture of a view, of which each process renders its share of the rays; differentiable."""
@@ -131,7 +125,7 @@ class SceneViews:
         return gather_rays(own, view.picture[..., 0].numel()).view(view.picture.shape)
 
     def report(self) -> str:
-        """What is kept in memory, in a line."""
+        """In a line, what is kept in memory."""
         frozen = [view.frozen for view in self.views]
         kept, chunks = sum(view.kept_bytes for view in frozen), sum(view.num_chunks for view in frozen)
         whole = sum(view.is_kept for view in frozen)

@@ -29,7 +29,7 @@ class UnseenViews:
 
     Args:
         backbone: the feature network.
-        cameras: the training cameras, two or more.
+        cameras: of the photos, two or more.
         photos: what they saw, in [0, 1], on the network's device.
         side: longer side, in pixels, at which views are rendered, and the network sees them and the photos.
     """
@@ -46,16 +46,13 @@ class UnseenViews:
 
     def embedding(self, picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 C"]:
         """What the network says that a picture shows."""
-        return pooled_features(
-            self.backbone(fit_side(picture.permute(2, 0, 1)[None], self.side, self.backbone.smallest_side))
-        )
+        image = fit_side(picture.permute(2, 0, 1)[None], self.side, self.backbone.smallest_side)
+        return pooled_features(self.backbone(image))
 
     def loss(self, model: CoarseFewShotModel, generator: torch.Generator) -> Float[Tensor, ""]:
         """The loss of one view, rendered as training rays are, at the exposure of the photo that it is held against.
 
-        Args:
-            model: in training.
-            generator: draws view and photo; on the CPU.
+        View and photo are drawn by `generator`, on the CPU.
         """
         place = int(torch.randint(len(self.places), (), generator=generator))
         photo = int(torch.randint(len(self.photos), (), generator=generator))

@@ -4,7 +4,6 @@ nerfstudio's layout: a run's folder nerfstudio_models has step-000000123.ckpt, w
 pipeline, optimisers and schedulers; here also notes on what made it.
 """
 
-import copy
 import re
 from pathlib import Path
 from typing import Any, Dict, List, Mapping, Optional, TypedDict
@@ -14,6 +13,7 @@ import torch
 from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor
 from torch.amp import GradScaler
+from torch.utils._pytree import tree_map_only
 
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
@@ -86,7 +86,7 @@ def write_checkpoint(
         optimizers: with their schedulers.
         notes: what made it.
         scaler: of gradients; None: one that is off.
-        unfinished: see `write_whole`; nerfstudio takes every file in the folder of checkpoints for one.
+        unfinished: see `write_whole`; not in the folder of checkpoints, where nerfstudio takes every file for one.
 
     Raises:
         InputError: a number in the state isn't finite.
@@ -106,21 +106,6 @@ def write_checkpoint(
         "scalers": (scaler or GradScaler(enabled=False)).state_dict(),
         **notes,
     }
-    write_whole(path, lambda file: torch.save(without_numpy_scalars(state), file), unfinished)
-
-
-def without_numpy_scalars(value: Any) -> Any:
-    """The same nested value with Python numbers for numpy's, which torch refuses to load (`weights_only`).
-
-    nerfstudio's exponential schedulers leave them in the state of scheduler and optimiser.
-    """
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, dict):
-        plain = copy.copy(value)  # keeps the kind of dictionary: a MultiStepLR's milestones are a Counter
-        for key, item in value.items():
-            plain[key] = without_numpy_scalars(item)
-        return plain
-    if isinstance(value, (list, tuple)):
-        return type(value)(without_numpy_scalars(item) for item in value)
-    return value
+    # nerfstudio's exponential schedulers leave numpy's numbers, which torch refuses to load (`weights_only`).
+    plain = tree_map_only(np.generic, lambda number: number.item(), state)
+    write_whole(path, lambda file: torch.save(plain, file), unfinished)

@@ -50,10 +50,10 @@ def style_facts(painting: Optional[str], run: str, notes: CheckpointNotes, itera
     facts = [("Painting", painting or "not known"), ("Run", run)]
     if iterations is not None:
         facts.append(("Iterations", str(iterations)))
-    if notes.backbone is not None:
-        facts.append(("Features", "{name}, {source}".format(**notes.backbone)))
-    if notes.coarse_run is not None:
-        facts.append(("Coarse run", notes.coarse_run))
+    if "backbone" in notes:
+        facts.append(("Features", "{name}, {source}".format(**notes["backbone"])))
+    if "coarse_run" in notes:
+        facts.append(("Coarse run", notes["coarse_run"]))
     return facts
 
 
@@ -64,4 +64,5 @@ def saved_notes(folder: Path) -> Tuple[CheckpointNotes, Optional[int]]:
         state = {} if newest is None else load_checkpoint(newest)
     except InputError:
         state = {}
-    return CheckpointNotes.of(state), state["step"] + 1 if state else None
+    notes = {name: state[name] for name in CheckpointNotes.__annotations__ if name in state}
+    return notes, state["step"] + 1 if state else None
