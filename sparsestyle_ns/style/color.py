@@ -20,11 +20,8 @@ def color_moments(
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
     """Mean and covariance of colours.
 
-    μ = Σ_i w_i c_i / Σ_i w_i and Σ = Σ_i w_i (c_i − μ)(c_i − μ)ᵀ / Σ_i w_i, computed and returned in float64.
-
-    Args:
-        colors: RGB in the last dimension, usually in [0, 1].
-        weights: how much each colour counts, 0 or more; all alike where left out.
+    μ = Σ_i w_i c_i / Σ_i w_i and Σ = Σ_i w_i (c_i − μ)(c_i − μ)ᵀ / Σ_i w_i, computed and returned in float64. Weights
+    are 0 or more; without them all colours count alike.
 
     Raises:
         InputError: there are no colours, or no weight is positive.
