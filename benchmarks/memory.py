@@ -36,7 +36,7 @@ def peak_of_steps(options: MemoryOptions, scene: Scene, coarse_run: Path, side: 
     training = Training(config, device, coarse.model_state())
     for _ in range(options.steps):
         training.step()
-    frozen = [view.frozen for view in training.pipeline.views]
+    frozen = [view.frozen for view in training.pipeline.task.views]
     height, width = training.pipeline.datamanager.pixels.sizes[0]
     return {
         "size": [width, height],

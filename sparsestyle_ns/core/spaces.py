@@ -71,13 +71,14 @@ class ForwardFacingSegments(LinearSegments):
     origins: Float[Tensor, "rays 3"]
     directions: Float[Tensor, "rays 3"]
     near: float
-    first: float
-    last: float
+    first: Float[Tensor, "rays 1"]
+    last: Float[Tensor, "rays 1"]
 
     def distance(self, s: Tensor) -> Tensor:
         """See `Segments.distance`."""
         t_ndc = self.first + s * (self.last - self.first)
-        return ndc_distance(t_ndc, self.origins, self.directions, self.near, max_distance=MAX_DISTANCE * self.near)
+        distance = ndc_distance(t_ndc, self.origins, self.directions, self.near, MAX_DISTANCE * self.near)
+        return distance.clamp(min=0.0)  # a ray may start at its own origin, but for rounding
 
     def at_distance(self, distance: Tensor) -> Tensor:
         """See `Segments.at_distance`."""
@@ -242,18 +243,21 @@ class ForwardFacingSpace(Space):
     def segments(self, origins: Tensor, directions: Tensor) -> ForwardFacingSegments:
         """See `Space.segments`."""
         start, extent, valid = ndc_rays(origins, directions, self.focal_over_half_size, self.near)
-        hit = valid.squeeze(-1)
+        # A camera that has flown past the nearest thing doesn't see what is behind it, and past the farthest, nothing.
+        own = ndc_parameter(torch.zeros_like(origins[:, :1]), origins, directions, self.near)
+        first, last = own.clamp(min=self.first), own.clamp(min=self.last)
+        hit = (valid & (first < last)).squeeze(-1)
         size = self.maximum - self.minimum
         scale = 2.0 / torch.where(size > 0, size, 2.0)
         return ForwardFacingSegments(
-            start=(start + self.first * extent - self.minimum) * scale - 1.0,
-            extent=(self.last - self.first) * extent * scale * hit[:, None],
+            start=(start + first * extent - self.minimum) * scale - 1.0,
+            extent=(last - first) * extent * scale * hit[:, None],
             hit=hit,
             origins=origins,
             directions=directions,
             near=self.near,
-            first=self.first,
-            last=self.last,
+            first=first,
+            last=last,
         )
 
 

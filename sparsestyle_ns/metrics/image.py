@@ -34,7 +34,12 @@ MIN_SHIFT_TOLERANT_SIDE = 24
 
 def psnr(image: Float[Tensor, "H W 3"], reference: Float[Tensor, "H W 3"]) -> float:
     """Peak signal-to-noise ratio in dB, of images in [0, 1]."""
-    return float(-10.0 * torch.log10((image - reference).square().mean()))
+    return float(psnr_of_error((image - reference).square().mean()))
+
+
+def psnr_of_error(error: Float[Tensor, ""]) -> Float[Tensor, ""]:
+    """Peak signal-to-noise ratio in dB, −10 log10 of the mean squared error of colours in [0, 1]."""
+    return -10.0 * torch.log10(error)
 
 
 def has_lpips() -> bool:

@@ -60,6 +60,7 @@ COVERED = set()
 ELSEWHERE = {
     "sparsestyle_ns.field_components.hash_grid_triton": "needs CUDA or Triton's interpreter: test_hash_grid.py",
     "sparsestyle_ns.rendering.baked_kernels.march_rays": "is what march_compiled calls",
+    "sparsestyle_ns.core.camera_geometry": "takes cameras of a scene: test_camera_geometry.py",
     "sparsestyle_ns.core.camera_paths": "takes nerfstudio's cameras: test_camera_paths.py",
     "sparsestyle_ns.core.schedules": "test_schedules.py and test_hard_schedules.py",
     "sparsestyle_ns.losses.stylization.default_weights": "takes no input: test_stylization.py",
