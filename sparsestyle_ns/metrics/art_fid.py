@@ -40,8 +40,8 @@ def frechet_distance(first: Float[Tensor, "n C"], second: Float[Tensor, "m C"]) 
 
     With X and X' the centred samples over √(n − 1) and √(m − 1), Σ = XᵀX and Σ' = X'ᵀX', the eigenvalues of Σ Σ' other
     than 0 are those of (X X'ᵀ)(X X'ᵀ)ᵀ. So the last trace is the sum of the singular values of X X'ᵀ, a matrix of n × m
-    numbers, however singular the covariances are. A sample of one has the covariance 0. The distance is 0 where mean and
-    covariance are equal, else more, in units of the features squared.
+    numbers, however singular the covariances are. A sample of one has the covariance 0. The result, in
+    units of the features squared, is 0 where mean and covariance are equal, else more.
     """
     samples = [sample.double() for sample in (first, second)]
     means = [sample.mean(dim=0) for sample in samples]
