@@ -120,7 +120,7 @@ def tradeoff(options: Annotated[TradeoffOptions, tyro.conf.arg(name="")]) -> Non
     Writes curves of error against time for each setting that trades one for the other, as a page that opens offline,
     JSON and CSV, and says in plain words what to turn. Ctrl-C keeps what has been measured.
     """
-    from sparsestyle_ns.studies.tradeoff.measuring import tradeoff as run
+    from sparsestyle_ns.studies.tradeoff import tradeoff as run
 
     run(options)
 

@@ -136,27 +136,19 @@ def _look_at(photo: Float[np.ndarray, "H W 4"], cameras: Cameras, index: int) ->
 
 
 def distances_along(
-    origins_first: Float[np.ndarray, "rays 3"],
-    directions_first: Float[np.ndarray, "rays 3"],
-    origins_second: Float[np.ndarray, "rays 3"],
-    directions_second: Float[np.ndarray, "rays 3"],
-) -> Tuple[Float[np.ndarray, "rays"], Float[np.ndarray, "rays"]]:
+    origins: Float[np.ndarray, "2 rays 3"], directions: Float[np.ndarray, "2 rays 3"]
+) -> Float[np.ndarray, "2 rays"]:
     """Where two rays of unit direction come nearest to each other: the distance from either's origin.
 
     Infinite where they are parallel; negative where they come nearest behind an origin.
     """
-    between = origins_first - origins_second
-    cosine = (directions_first * directions_second).sum(axis=-1)
+    cosine = directions.prod(axis=0).sum(axis=-1)
     # 1 − cos² without its cancellation for rays that are nearly parallel.
-    square_of_sine = (np.cross(directions_first, directions_second) ** 2).sum(axis=-1)
-    along_first, along_second = (
-        (direction * between).sum(axis=-1) for direction in (directions_first, directions_second)
-    )
+    square_of_sine = (np.cross(*directions) ** 2).sum(axis=-1)
+    first, second = (directions * (origins[0] - origins[1])).sum(axis=-1)
+    along = np.stack([cosine * second - first, second - cosine * first])
     parallel = square_of_sine < 1e-12
-    safe = np.where(parallel, 1.0, square_of_sine)
-    first = np.where(parallel, np.inf, (cosine * along_second - along_first) / safe)
-    second = np.where(parallel, np.inf, (along_second - cosine * along_first) / safe)
-    return first, second
+    return np.where(parallel, np.inf, along / np.where(parallel, 1.0, square_of_sine))
 
 
 def neighbouring_pairs(poses: Float[np.ndarray, "views 3 4"]) -> List[Tuple[int, int]]:

@@ -46,7 +46,7 @@ def triangulate(scene: Scene) -> MatchedRays:
     matches, poses = scene.matches, scene.cameras.camera_to_worlds.double().numpy()
     views = np.array(scene.matched_views, dtype=int)[matches.views]
     origins = poses[views, :, 3]
-    distances = np.stack(distances_along(origins[0], matches.directions[0], origins[1], matches.directions[1]))
+    distances = distances_along(origins, matches.directions)
     ahead = (np.isfinite(distances) & (distances > 0)).all(axis=0)
     parts = (origins, matches.directions, distances[..., None])
     rays = (torch.from_numpy(part[:, ahead].reshape(-1, part.shape[-1])).float() for part in parts)

@@ -82,8 +82,9 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
         for name, weight in self.loss_weights.items():
             if name not in LOSSES:
-                known = ", ".join(LOSSES)
-                raise InputError(f"--pipeline.loss-weights names {name}, which is no loss; the losses are {known}.")
+                raise InputError(
+                    f"--pipeline.loss-weights names {name}, which is no loss; the losses are {', '.join(LOSSES)}."
+                )
             if not 0.0 <= weight < math.inf:
                 raise InputError(f"--pipeline.loss-weights.{name} is {weight}; give a finite number, 0 or more.")
         if not any(self.loss_weights.values()):
@@ -104,15 +105,8 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         return weights
 
 
-@dataclass
-class StyleTask:
-    """A field that is on its way to a painting.
-
-    Attributes:
-        style: the field.
-        targets: the painting.
-        views: what it is stylised on; in turn, one an iteration.
-    """
+class StyleTask(NamedTuple):
+    """A field that is on its way to a painting, and the views that it is stylised on; in turn, one an iteration."""
 
     style: nn.Module
     targets: StyleTargets
@@ -141,15 +135,10 @@ class HierStylePipeline(CheckedPipeline):
 
     def freeze_views(self) -> SceneViews:
         """The scene's views, with all that depends on no style."""
-        config, manager = self.config, self.datamanager
-        return SceneViews(
-            self.model,
-            manager.pixels,
-            manager.train_dataset.cameras,
-            config.novel_views,
-            config.samples_per_chunk,
-            config.cache_gigabytes,
-        )
+        config, photos = self.config, self.datamanager.pixels
+        cameras = self.datamanager.train_dataset.cameras
+        sizes = config.novel_views, config.samples_per_chunk, config.cache_gigabytes
+        return SceneViews(self.model, photos, cameras, *sizes)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

@@ -1,29 +1,32 @@
-"""Plots as SVG: lines with a legend, and what the plots of all studies look like."""
+"""Plots of losses in training, and of curves of error against time."""
 
 import io
-from typing import Mapping, Sequence, Tuple
+import math
+from typing import List, Mapping, Sequence, Tuple
 
 import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+from sparsestyle_ns.studies.curves import METRICS, Curve, Point
 
 COLORS = ("#33617f", "#b4492b", "#6a8f3c", "#8a5a9e", "#b58a2a", "#3f8f8a")
-GRID = {"color": "#e4e1da", "lw": 0.6}
+CHOSEN, FRONT, GRID = "#b4492b", "#9aa5ab", {"color": "#e4e1da", "lw": 0.6}
 STYLE = {
     "svg.fonttype": "none",
     "font.size": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.prop_cycle": matplotlib.cycler(color=COLORS),
+    "legend.frameon": False,
+    "legend.fontsize": 8,
 }
 SIZE = (5.4, 3.5)
 """Inches."""
-
-
-def as_svg(figure: Figure) -> str:
-    """A figure as SVG, the same each time."""
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
+COLUMNS = 3
+"""Of the overview."""
 
 
 def line_plot(
@@ -41,10 +44,89 @@ def line_plot(
         figure = Figure(figsize=SIZE, layout="constrained")
         cell = figure.subplots()
         for name, (x, y) in series.items():
-            (line,) = cell.plot(x, y, label=name, linewidth=1.5)
-            if marks:
-                cell.plot(x[-1:], y[-1:], "o", color=line.get_color())
+            cell.plot(x, y, label=name, linewidth=1.5, marker="o" if marks else "", markevery=[-1])
         cell.set(xlabel=x_label, ylabel=y_label)
-        cell.legend(frameon=False)
+        cell.legend()
         cell.grid(True, **GRID)
-        return as_svg(figure)
+        return _as_svg(figure)
+
+
+def curve_plot(curve: Curve, x: str, y: str) -> str:
+    """Two metrics of a curve as SVG."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=SIZE, layout="constrained")
+        _draw(figure.subplots(), curve, x, y)
+        return _as_svg(figure)
+
+
+def overview(curves: Sequence[Curve]) -> bytes:
+    """The main plots of all curves in one PNG picture."""
+    rows = math.ceil(len(curves) / COLUMNS)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(COLUMNS * 4.2, rows * 3.0), layout="constrained", dpi=90)
+        cells = figure.subplots(rows, COLUMNS, squeeze=False).flatten()
+        for cell, curve in zip(cells, curves, strict=False):
+            _draw(cell, curve, *curve.plots[0])
+            cell.set_title(curve.title, fontsize=10, loc="left")
+        for cell in cells[len(curves) :]:
+            cell.set_axis_off()
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def _as_svg(figure: Figure) -> str:
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
+
+
+def _draw(cell: Axes, curve: Curve, x: str, y: str) -> None:
+    """Points with the spread of their repetitions, the front, and a ring around the recommended one.
+
+    Hollow points were measured while the machine was busy. Where a number is infinite, a triangle at the top stands for
+    it.
+    """
+    points = [point for point in curve.points if x in point.values and y in point.values]
+    finite = [point.median(y) for point in points if math.isfinite(point.median(y))] or [0.0, 1.0]
+    top = max(finite) + 0.12 * ((max(finite) - min(finite)) or 1.0)
+
+    def places(some: Sequence[Point]) -> Tuple[List[float], List[float]]:
+        return [point.median(x) for point in some], [min(point.median(y), top) for point in some]
+
+    settings = dict.fromkeys(point.setting for point in points)
+    for number, setting in enumerate(settings):
+        run = sorted((point for point in points if point.setting == setting), key=lambda point: point.median(x))
+        color = COLORS[number % len(COLORS) if curve.has_runs else 0]
+        cell.plot(*places(run), color=color, lw=1.5, label=setting)
+        for point in run:
+            (across,), (up,) = places([point])
+            spreads = [
+                [[middle - spread.low], [spread.high - middle]] if math.isfinite(spread.high) else None
+                for middle, spread in ((across, point.spread(x)), (up, point.spread(y)))
+            ]
+            mark, face = "o" if spreads[1] else "^", "white" if point.busy else color
+            cell.errorbar(across, up, *reversed(spreads), fmt=mark, color=color, mfc=face, ms=5, lw=1, zorder=3)
+            if not curve.has_runs:
+                cell.annotate(setting, (across, up), (5, 5), textcoords="offset points", fontsize=8)
+    if curve.has_runs:
+        cell.legend()
+    if (x, y) == curve.plots[0]:
+        front = [point for point in curve.front if point in points]
+        cell.plot(*places(front), "--", color=FRONT, lw=1, zorder=1)
+    if curve.recommended in points:
+        cell.plot(*places([curve.recommended]), "o", ms=13, mfc="none", mec=CHOSEN, mew=1.8, zorder=4)
+    cell.set(xlabel=METRICS[x].label, ylabel=METRICS[y].label)
+    for metric, scale in ((x, cell.xaxis), (y, cell.yaxis)):
+        if METRICS[metric].log and all(point.median(metric) > 0 for point in points):
+            _make_logarithmic(scale)
+    cell.grid(True, which="major", **GRID)
+    cell.margins(0.12)
+
+
+def _make_logarithmic(scale: Axis) -> None:
+    """Labels 1, 2, 5, 10, …: with a label at each minor tick those of less than a decade run into each other."""
+    scale.axes.set(**{f"{scale.axis_name}scale": "log"})
+    scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    scale.set_major_formatter(StrMethodFormatter("{x:g}"))
+    scale.set_minor_formatter(NullFormatter())

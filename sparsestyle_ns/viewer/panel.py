@@ -95,8 +95,10 @@ class StylePanel(ViewerControl):
         hint = "baked: quick from a voxel grid, once it has seen a place"
         self.mode = gui.add_dropdown("Render mode", RENDER_MODES, mode, hint=hint)
         self.split = gui.add_checkbox("Coarse | stylised", False)
-        for control in (self.strength, self.geometry, self.style, self.other, self.blend, self.mode):
+        for control in (self.strength, self.geometry, self.blend, self.mode):
             control.on_update(lambda _: self._changed())
+        self.style.on_update(lambda _: self._style_chosen())
+        self.other.on_update(lambda _: self._other_chosen())
         self.split.on_update(lambda _: self.apply_split())
         self.training = gui.add_markdown("", image_root=Path(), visible=False)
         self.restyling = RestylingControls(
@@ -190,9 +192,15 @@ class StylePanel(ViewerControl):
 
     def _changed(self) -> None:
         self._last_change = time.monotonic()
-        self.blend.visible = self.other.value != NO_BLEND
-        self.description.content = self._chosen().markdown()
         self.viewer._trigger_rerender()
+
+    def _style_chosen(self) -> None:
+        self.description.content = self._chosen().markdown()
+        self._changed()
+
+    def _other_chosen(self) -> None:
+        self.blend.visible = self.other.value != NO_BLEND
+        self._changed()
 
     def apply_split(self) -> None:
         """Shows the coarse field on the left and the stylised one on the right, or the stylised one alone."""

@@ -24,7 +24,7 @@ def test_a_dataparser_is_named_with_its_options(llff_scene: Path) -> None:
 def test_what_is_missing_is_said(tmp_path: Path) -> None:
     for words, folder, sentence in (
         (("no-data",), tmp_path, "There is no dataparser no-data"),
-        (("llff-data",), tmp_path / "gone", "There is no .*gone"),
+        (("llff-data",), tmp_path / "gone", "There is no scene at --data .*gone"),
         ((), tmp_path, "has none of poses_bounds.npy, .* the dataparser isn't known"),
     ):
         with pytest.raises(InputError, match=sentence):

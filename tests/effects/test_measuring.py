@@ -169,16 +169,16 @@ def test_rays_to_the_same_point_meet_at_their_distances_from_it():
     origins = generator.uniform(3, 5, (2, 20, 3))
     expected = np.linalg.norm(points - origins, axis=-1)
     directions = (points - origins) / expected[..., None]
-    assert distances_along(origins[0], directions[0], origins[1], directions[1]) == pytest.approx(expected)
+    assert distances_along(origins, directions) == pytest.approx(expected)
     # Turned away from each other's side, the same lines meet behind the cameras.
-    behind = distances_along(origins[0], -directions[0], origins[1], -directions[1])
+    behind = distances_along(origins, -directions)
     assert behind == pytest.approx(-expected)
 
 
 def test_rays_that_pass_each_other_are_measured_where_they_come_nearest_and_parallel_ones_never():
     origins, ahead = np.array([[0.0, 0, 0], [0, 0, 0]]), np.array([[0.0, 0, -1], [0, 0, -1]])
     others, crossing = np.array([[-2.0, 0.5, -3], [1, 0, 0]]), np.array([[1.0, 0, 0], [0, 0, -1]])
-    first, second = distances_along(origins, ahead, others, crossing)
+    first, second = distances_along(np.stack([origins, others]), np.stack([ahead, crossing]))
     assert (first.tolist(), second.tolist()) == ([3.0, np.inf], [2.0, np.inf])
 
 

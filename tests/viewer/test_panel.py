@@ -27,8 +27,7 @@ from PIL import Image
 
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
-from sparsestyle_ns.engine.training import Training
-from sparsestyle_ns.engine.training_step import warm_start
+from sparsestyle_ns.engine.training import Training, warm_start
 from sparsestyle_ns.export.stylised_scene import load_scene
 from sparsestyle_ns.gallery.make_gallery import collect_run
 from sparsestyle_ns.losses.stylization import Losses

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Dict, List, Mapping, Sequence, Union
 
 from sparsestyle_ns.evaluation.tables import Table
+from sparsestyle_ns.studies.advice import recommendation
+from sparsestyle_ns.studies.curves import METRICS, Curve, Point
 from sparsestyle_ns.studies.options import Group
 from sparsestyle_ns.studies.page import Section, study_page
-from sparsestyle_ns.studies.tradeoff.advice import recommendation
-from sparsestyle_ns.studies.tradeoff.curve_plots import curve_svg, overview_png
-from sparsestyle_ns.studies.tradeoff.curves import METRICS, Curve, Point
+from sparsestyle_ns.studies.plots import curve_plot, overview
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 
@@ -89,7 +89,7 @@ class Report:
             write_whole(folder / JSON_FILE, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
             write_whole(folder / CSV_FILE, as_csv(self.curves))
             if self.measured:
-                write_whole(folder / PICTURE_FILE, overview_png(self.measured))
+                write_whole(folder / PICTURE_FILE, overview(self.measured))
             page = study_page(f"What accuracy costs in time: {self.scene}", self.sections())
             return write_whole(folder / PAGE_FILE, page)
         except OSError as error:
@@ -141,7 +141,7 @@ def curve_section(curve: Curve) -> Section:
     """What the page shows of a curve that has points."""
     order = "" if curve.order is None else f" Observed order of convergence: {curve.order:.2f}."
     plots = [
-        (curve_svg(curve, x, y), f"{METRICS[y].label} against {METRICS[x].label}")
+        (curve_plot(curve, x, y), f"{METRICS[y].label} against {METRICS[x].label}")
         for x, y in curve.plots
         if any(x in point.values and y in point.values for point in curve.points)
     ]

@@ -14,13 +14,14 @@ from clock import FakeClock
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
+from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.studies import tradeoff
+from sparsestyle_ns.studies.measure_training import StageRuns
 from sparsestyle_ns.studies.options import TradeoffOptions
-from sparsestyle_ns.studies.study import Study, get_setting, parse_dataparser
-from sparsestyle_ns.studies.tradeoff import measuring
-from sparsestyle_ns.studies.tradeoff.measure_training import StageRuns
-from sparsestyle_ns.studies.tradeoff.time_budget import Budget
-from sparsestyle_ns.studies.tradeoff.workbench import Workbench, squeezed
+from sparsestyle_ns.studies.study import Study, get_setting
+from sparsestyle_ns.studies.time_budget import Budget
+from sparsestyle_ns.studies.workbench import Workbench, squeezed
 from sparsestyle_ns.utils.errors import InputError
 
 TICK = 0.01
@@ -60,7 +61,7 @@ def make_study(scene, dataparser=None, **more):
 def measure(scene, folder, seconds, dataparser=None, **more):
     clock = FakeClock(TICK)
     options = TradeoffOptions(scene, output_dir=folder, rounds=1, **more)
-    return measuring.measure(make_study(scene, dataparser), options, Budget(seconds, clock)), clock
+    return tradeoff.measure(make_study(scene, dataparser), options, Budget(seconds, clock)), clock
 
 
 @pytest.fixture(scope="module")
@@ -219,11 +220,11 @@ def test_the_last_line_names_the_report_and_trains_on_the_scene(tmp_path, monkey
     report = SimpleNamespace(
         write=lambda folder: folder / "index.html", recommendation=["Take 4."], everything_left_out=lambda: []
     )
-    monkeypatch.setattr(measuring, "measure", lambda *_: report)
+    monkeypatch.setattr(tradeoff, "measure", lambda *_: report)
     options = TradeoffOptions(
         tmp_path, ("llff-data", "--eval-interval", "4"), output_dir=tmp_path, max_image_side=64, num_views=4
     )
-    measuring.tradeoff(options)
+    tradeoff.tradeoff(options)
     train = f"ns-train coarse-fewshot-draft --num-views 4 --max-image-side 64 --data {tmp_path} llff-data"
     last = f"Made {tmp_path / 'index.html'} – next: {train} --eval-interval 4"
     assert capsys.readouterr().out.splitlines() == ["Take 4.", last]
@@ -232,7 +233,7 @@ def test_the_last_line_names_the_report_and_trains_on_the_scene(tmp_path, monkey
 def test_options_become_the_study(tmp_path):
     (tmp_path / "poses_bounds.npy").touch()
     options = TradeoffOptions(tmp_path, full=True, view_ids=(1, 2), backbone="vgg16", vgg_weights=Path("mine.pth"))
-    study = measuring.study_of(options)
+    study = tradeoff.study_of(options)
     config = study.config("hier-style", style_image=Path("hat.jpg"))
     assert (config.method_name, config.pipeline.style_image) == ("hier-style", Path("hat.jpg"))
     assert (config.pipeline.backbone, config.pipeline.vgg_weights) == ("vgg16", Path("mine.pth"))

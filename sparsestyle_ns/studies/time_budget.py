@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 from typing import Callable, Dict, Mapping, Sequence, Tuple
 
-from sparsestyle_ns.studies.tradeoff.curves import Curve, Values
+from sparsestyle_ns.studies.curves import Curve, Values
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.machine import LoadWatch
 

@@ -4,11 +4,11 @@ import math
 from typing import Dict, List, NamedTuple, Sequence, Tuple
 
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
+from sparsestyle_ns.studies.curves import Curve, Values
 from sparsestyle_ns.studies.options import Group
 from sparsestyle_ns.studies.study import flag_of, get_setting, with_setting
-from sparsestyle_ns.studies.tradeoff.curves import Curve, Values
-from sparsestyle_ns.studies.tradeoff.time_budget import Budget, Case, OutOfTimeError, Plan, in_turns
-from sparsestyle_ns.studies.tradeoff.workbench import Workbench, squeezed
+from sparsestyle_ns.studies.time_budget import Budget, Case, OutOfTimeError, Plan, in_turns
+from sparsestyle_ns.studies.workbench import Workbench, squeezed
 from sparsestyle_ns.utils.machine import PeakMemory
 
 LONG_STOPS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1)

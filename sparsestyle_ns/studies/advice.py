@@ -2,8 +2,8 @@
 
 from typing import List, Optional, Sequence
 
-from sparsestyle_ns.studies.tradeoff.curves import Curve, Point
-from sparsestyle_ns.studies.tradeoff.pareto import decibels_lost, time_factor_of_a_decibel
+from sparsestyle_ns.studies.curves import Curve, Point
+from sparsestyle_ns.studies.pareto import decibels_lost, time_factor_of_a_decibel
 from sparsestyle_ns.utils import progress
 
 SMALL_GAIN = 0.05

@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from sparsestyle_ns.studies.tradeoff.pareto import (
+from sparsestyle_ns.studies.pareto import (
     decibels,
     decibels_lost,
     error_that_costs,

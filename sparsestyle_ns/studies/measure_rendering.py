@@ -20,11 +20,11 @@ from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.rendering.baked import render_baked
 from sparsestyle_ns.rendering.render import POINTS_PER_CALL, render_coarse
+from sparsestyle_ns.studies.curves import Curve, Values
+from sparsestyle_ns.studies.pareto import decibels, observed_order
 from sparsestyle_ns.studies.study import flag_of, get_setting, with_setting
-from sparsestyle_ns.studies.tradeoff.curves import Curve, Values
-from sparsestyle_ns.studies.tradeoff.pareto import decibels, observed_order
-from sparsestyle_ns.studies.tradeoff.time_budget import Budget, Case, OutOfTimeError, Plan, in_turns
-from sparsestyle_ns.studies.tradeoff.workbench import Model, Workbench
+from sparsestyle_ns.studies.time_budget import Budget, Case, OutOfTimeError, Plan, in_turns
+from sparsestyle_ns.studies.workbench import Model, Workbench
 
 Colors = Float[Tensor, "rays 3"]
 Change = Callable[[], ContextManager[None]]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple, Union
 
 from sparsestyle_ns.studies.options import Group
-from sparsestyle_ns.studies.tradeoff.pareto import (
+from sparsestyle_ns.studies.pareto import (
     TIME_EXPONENT,
     decibels,
     decibels_lost,

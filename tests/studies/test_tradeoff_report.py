@@ -6,10 +6,11 @@ import math
 import re
 
 import pytest
-from sparsestyle_ns.studies.tradeoff.report import Report
-from sparsestyle_ns.studies.tradeoff.words import duration, recommendation, setting_line
 
-from sparsestyle_ns.studies.tradeoff.pareto import root_mean_square
+from sparsestyle_ns.studies.advice import duration, recommendation, setting_line
+from sparsestyle_ns.studies.curves import Curve
+from sparsestyle_ns.studies.pareto import root_mean_square
+from sparsestyle_ns.studies.tradeoff_report import Report
 from sparsestyle_ns.utils.errors import InputError
 
 

@@ -28,9 +28,9 @@ from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipe
 from sparsestyle_ns.pipelines.scene_views import SceneViews
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
 from sparsestyle_ns.runs.scene_record import record_scene
+from sparsestyle_ns.studies.pareto import root_mean_square
 from sparsestyle_ns.studies.study import Study
-from sparsestyle_ns.studies.tradeoff.pareto import root_mean_square
-from sparsestyle_ns.studies.tradeoff.time_budget import Budget, OutOfTimeError
+from sparsestyle_ns.studies.time_budget import Budget, OutOfTimeError
 from sparsestyle_ns.utils.machine import LoadWatch, synchronize
 
 Model = Union[CoarseFewShotModel, HierStyleModel]
@@ -259,8 +259,9 @@ class Workbench:
             figures = image_metrics(outputs["rgb"], self.photos[view])
             return {name: figures[name] for name in ("psnr", "ssim")}
         accumulation = None if model.background is None else outputs["accumulation"].squeeze(-1)
-        style, content = self.targets.losses(outputs["rgb"], self.targets.features(outputs["rgb_coarse"]), accumulation)
-        return {"style_loss": float(style), "content_loss": float(content)}
+        content = self.targets.features(outputs["rgb_coarse"])
+        losses = self.targets.losses(self.targets.view(outputs["rgb"], content, accumulation))
+        return {f"{name}_loss": float(value) for name, value in losses.items()}
 
     def seconds_to_evaluate(self, model: Model, views: Sequence[int]) -> float:
         """What `evaluate` will take, by what it took before."""

@@ -7,8 +7,8 @@ sys.path.append(str(Path(__file__).parent))
 
 from clock import FakeClock
 
-from sparsestyle_ns.studies.tradeoff.curves import Curve
-from sparsestyle_ns.studies.tradeoff.time_budget import (
+from sparsestyle_ns.studies.curves import Curve
+from sparsestyle_ns.studies.time_budget import (
     Budget,
     Case,
     OutOfTimeError,
