@@ -1,14 +1,12 @@
-"""Figures set out in tables, on a terminal and for a page."""
+"""Figures set out in tables, for a terminal and for pages."""
 
 from dataclasses import dataclass, field
-from html import escape
 from typing import Dict, List, Optional, Sequence, Tuple
 
 from rich.console import Console
 from rich.table import Table as RichTable
 
 from sparsestyle_ns.metrics.art_fid import why_left_out
-from sparsestyle_ns.utils.page import table
 
 LABELS: Dict[str, Tuple[str, int]] = {
     "psnr": ("PSNR dB ↑", 2),
@@ -59,12 +57,6 @@ class Table:
         for name, cells in self.rows:
             printed.add_row(name, *(cell or "–" for cell in cells), style="italic dim" if name in self.cited else None)
         Console().print(printed)
-
-    def html(self) -> str:
-        """It for a page."""
-        rows = [(name, *(cell or "–" for cell in cells)) for name, cells in self.rows]
-        note = f"<p>{escape(self.note)}</p>" if self.note else ""
-        return f"<div><h3>{escape(self.title)}</h3>{table(('', *self.columns), rows, self.cited)}{note}</div>\n"
 
 
 def written(key: str, value: Optional[float]) -> Optional[str]:

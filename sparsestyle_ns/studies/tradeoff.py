@@ -50,7 +50,7 @@ def tradeoff(options: TradeoffOptions) -> None:
         lines += [f"Left out, {len(left_out)}:", *(f"  {line}" for line in left_out)]
     Console().print(*lines, sep="\n", markup=False, highlight=False, soft_wrap=True)
     method = study.method("coarse-fewshot")
-    finish(page.resolve(), ["ns-train", method, *scene_arguments(study.config("coarse-fewshot"), method)])
+    finish(page.resolve(), ["ns-train", method, *scene_arguments(study.config("coarse-fewshot"))])
 
 
 def study_of(options: TradeoffOptions) -> Study:

@@ -5,10 +5,7 @@
 
 import base64
 import io
-from html import escape
-from importlib.resources import files
 from pathlib import Path
-from typing import Collection, Optional, Sequence
 
 import numpy as np
 from jaxtyping import UInt8
@@ -87,70 +84,3 @@ def write_page(page: str, output_path: Path) -> Path:
         InputError: it can't be written there.
     """
     return write_output(output_path, page.encode(), "The page", EXAMPLE_NAME)
-
-
-# Pages in strings, until the studies' pages are templates too.
-
-CONTENT_POLICY = (
-    "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
-)
-
-
-def html_page(title: str, style: str, body: str) -> str:
-    """A whole page.
-
-    Args:
-        title: plain text.
-        style: rules beside the shared ones.
-        body: HTML.
-    """
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{CONTENT_POLICY}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="color-scheme" content="light dark">\n<link rel="icon" href="data:,">\n'
-        f"<title>{escape(title)}</title>\n<style>{_shared_style()}{style}</style>\n</head>\n<body>\n"
-        f"{body}\n</body>\n</html>\n"
-    )
-
-
-def picture_page(title: str, contents: str, sections: str, style: str = "", script: str = "") -> str:
-    """A whole page of sections with pictures and tables.
-
-    Args:
-        title: its heading, plain text.
-        contents: HTML below the heading.
-        sections: HTML of its body.
-        style: rules beside those of pictures and tables.
-        script: what it does.
-    """
-    body = f'<header class="top"><h1>{escape(title)}</h1>{contents}</header>\n<main>\n{sections}</main>' + (
-        f"\n<script>{script}</script>" if script else ""
-    )
-    return html_page(title, style, body)
-
-
-def _shared_style() -> str:
-    return (files("sparsestyle_ns.utils") / "templates" / "base.css").read_text(encoding="utf-8")
-
-
-def image(pixels: Pixels, alternative: str, name: str = "") -> str:
-    """A picture as HTML, of a class `name` if there is one; the alternative text is plain."""
-    height, width = pixels.shape[:2]
-    names = f' class="{name}"' if name else ""
-    return f'<img{names} src="{data_uri(pixels)}" width="{width}" height="{height}" alt="{escape(alternative)}">'
-
-
-def figure(pixels: Pixels, caption: str, alternative: Optional[str] = None) -> str:
-    """A picture with its caption, as HTML; both texts are plain."""
-    return f"<figure>{image(pixels, alternative or caption)}<figcaption>{escape(caption)}</figcaption></figure>"
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]], cited: Collection[str] = ()) -> str:
-    """A table of plain texts as HTML; rows whose first cell is in `cited` are marked as others' figures."""
-    heads = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
-    body = ""
-    for row in rows:
-        mark = " class=cited" if row[0] in cited else ""
-        body += f"<tr{mark}>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>"
-    return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table></div>'
