@@ -3,22 +3,25 @@
 import gc
 import json
 import os
+import resource
 import statistics
 import subprocess
+import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Literal, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, List, Literal, Optional, Sequence, Tuple, Union
 
+import psutil
 import torch
 from torch import Tensor
 
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
-from sparsestyle_ns.utils.machine import OtherLoad, device_name, synchronize, versions
+from sparsestyle_ns.utils.machine import BUSY_SHARE, core_seconds, device_name, others_share, synchronize, versions
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -81,6 +84,39 @@ class Options:
     def num_threads(self) -> int:
         """Threads on the CPU."""
         return self.threads or os.cpu_count() or 1
+
+
+# -------------------------------------------------------------------------------------------------------- the machine
+
+
+def peak_bytes(device: torch.device) -> int:
+    """The most memory this process has had: of a GPU what torch had allocated, else all that was resident."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    status = Path("/proc/self/status")
+    if status.is_file():
+        # Unlike getrusage's figure, this one isn't inherited from the process that started this one.
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+class OtherLoad:
+    """How much of all cores other processes use: for a second before a benchmark, and on average while it runs."""
+
+    def __init__(self) -> None:
+        self.before = psutil.cpu_percent(interval=1.0) / 100
+        self._start = core_seconds()
+
+    def record(self) -> Dict[str, Union[float, bool]]:
+        """Both shares, in [0, 1], and whether the machine counts as busy."""
+        during = others_share(self._start, core_seconds())
+        return {
+            "before": round(self.before, 3),
+            "during": round(during, 3),
+            "busy": max(self.before, during) > BUSY_SHARE,
+        }
 
 
 # ------------------------------------------------------------------------------------------------------------- timing

@@ -6,12 +6,11 @@ from typing import Any, Dict, List
 
 import tyro
 
-from benchmarks._measure import Options, Ratio, Report, in_fresh_process
+from benchmarks._measure import Options, Ratio, Report, in_fresh_process, peak_bytes
 from benchmarks._scene import Scene, find_or_train_coarse, find_scene, style_config
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.runs.coarse_run import read_coarse_run
 from sparsestyle_ns.utils.errors import exit_on_input_error
-from sparsestyle_ns.utils.machine import peak_bytes
 
 SIDES = (1008, 252)
 LIMIT = 8_000_000_000
@@ -37,7 +36,7 @@ def peak_of_steps(options: MemoryOptions, scene: Scene, coarse_run: Path, side: 
     training = Training(config, device, coarse.model_state())
     for _ in range(options.steps):
         training.step()
-    frozen = [view.frozen for view in training.pipeline.views]
+    frozen = [view.frozen for view in training.pipeline.task.views]
     height, width = training.pipeline.datamanager.pixels.sizes[0]
     return {
         "size": [width, height],

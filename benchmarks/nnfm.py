@@ -11,7 +11,7 @@ import tyro
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks._measure import Options, Report, check_equal, in_fresh_process, ratio_of_pairs, timed
+from benchmarks._measure import Options, Report, check_equal, in_fresh_process, peak_bytes, ratio_of_pairs, timed
 from benchmarks._scene import BACKBONE, find_scene, load_photos
 from sparsestyle_ns.losses.content import content_loss
 from sparsestyle_ns.losses.nnfm import nnfm_loss
@@ -20,7 +20,6 @@ from sparsestyle_ns.losses.stylization import feature_rows, fit_side
 from sparsestyle_ns.style.backbones import load_backbone
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import exit_on_input_error
-from sparsestyle_ns.utils.machine import peak_bytes
 
 PHOTO_SIDE, STYLE_SIDE = 504, 1000
 TARGET = 2.0

@@ -31,7 +31,7 @@ def main(options: Options) -> None:
 
     measures = {"ours": timed(ours.step, report.device), "plain": timed(plain.step, report.device)}
     found = report.measure("step", measures, options.repetitions(6))
-    views = ours.pipeline.views
+    views = ours.pipeline.task.views
     report.extra["settings"] = {
         "size": [width, height],
         "views": len(views),

@@ -26,7 +26,6 @@ from sparsestyle_ns.losses.nnfm import CHUNK_SIZE
 from sparsestyle_ns.losses.style_index import StyleIndex
 from sparsestyle_ns.losses.stylization import feature_rows
 from sparsestyle_ns.style.backbones import load_backbone
-from sparsestyle_ns.style.vgg import VGGFeatures
 from sparsestyle_ns.utils.errors import exit_on_input_error
 
 USUAL, EXACT = "as it is", "float32"
@@ -79,7 +78,7 @@ def feature_works(side: int, device: torch.device) -> Dict[str, Work]:
         return gradient
 
     state = {name: value.clone() for name, value in network.state_dict().items()}
-    turned = VGGFeatures(network.description, state, torch.contiguous_format).to(device)
+    turned = type(network)(network.description, state, torch.contiguous_format).to(device)
     works: Dict[str, Work] = {USUAL: lambda: work(network), "channels first": lambda: work(turned)}
     for name, context in formats(device).items():
         works[name] = lambda context=context: work(network, context)

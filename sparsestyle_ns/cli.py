@@ -76,7 +76,9 @@ def evaluate(
 @exit_on_input_error
 def effects(
     data: Path,
-    dataparser: Annotated[Tuple[str, ...], tyro.conf.Positional] = (),
+    dataparser: Annotated[
+        Tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[DATAPARSER [OPTION ...]]")
+    ] = (),
     json: bool = False,
     num_views: Optional[int] = None,
     view_ids: Optional[Tuple[int, ...]] = None,

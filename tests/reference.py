@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 import scipy.linalg
+import torch
 
 # ---------------------------------------------------------------------------------------------------------------------
 # losses
@@ -136,6 +137,17 @@ def contract(point):
     norm = max(abs(coordinate) for coordinate in point)
     factor = 0.5 if norm < 1 else (1 - 0.5 / norm) / norm
     return [factor * coordinate for coordinate in point]
+
+
+def ndc_points(points, focal_over_half_size, near=1.0):
+    """Images of world points in NDC (NeRF, appendix C): (-(2f/w) x/z, -(2f/h) y/z, 1 + 2n/z), of a tensor of points.
+
+    A point on or behind the camera plane has no image: its z is taken to be -1e-6 n.
+    """
+    x, y, z = points.unbind(-1)
+    z = z.clamp(max=-1e-6 * near)
+    scale_x, scale_y = focal_over_half_size
+    return torch.stack([-scale_x * x / z, -scale_y * y / z, 1 + 2 * near / z], dim=-1)
 
 
 def cell(position, resolution):

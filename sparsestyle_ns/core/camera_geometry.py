@@ -1,4 +1,4 @@
-"""What the poses of a scene's cameras say about how it was captured."""
+"""What the poses of a scene's cameras, with columns right, up, back and position, say about how it was captured."""
 
 import torch
 from jaxtyping import Float
@@ -10,11 +10,7 @@ MAX_SPREAD = 45.0
 
 
 def viewing_spread(poses: Float[Tensor, "cameras 3 4"]) -> float:
-    """Largest angle, in degrees, between a camera's viewing direction and the mean of all; 180 where they cancel.
-
-    Args:
-        poses: camera to world, with columns right, up, back and position.
-    """
+    """Largest angle, in degrees, between a camera's viewing direction and the mean of all; 180 where they cancel."""
     directions = normalize(-poses[:, :, 2].double(), dim=-1)
     mean = directions.mean(dim=0)
     if mean.norm() < 1e-6:
@@ -32,11 +28,7 @@ def is_forward_facing(poses: Float[Tensor, "cameras 3 4"]) -> bool:
 
 
 def meeting_point(poses: Float[Tensor, "cameras 3 4"]) -> Float[Tensor, "3"]:
-    """The point nearest to all viewing axes, by least squares; of parallel axes, the one nearest to the origin.
-
-    Args:
-        poses: camera to world, with columns right, up, back and position.
-    """
+    """The point nearest to all viewing axes, by least squares; of parallel axes, the one nearest to the origin."""
     axes = normalize(poses[:, :, 2].double(), dim=-1)
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
     target = (across @ poses[:, :, 3:].double()).sum(dim=0)

@@ -1,8 +1,4 @@
-"""Paths of cameras that are fixed by the training cameras, without chance or choice.
-
-One is that on which consistency is measured; others, made of the same pieces, show a scene in a film, and have views
-that nobody photographed.
-"""
+"""Paths of cameras that follow from the training cameras: to measure consistency on, to show a scene, to add views."""
 
 import itertools
 import math
@@ -13,6 +9,7 @@ from jaxtyping import Float
 from nerfstudio.cameras.camera_utils import get_interpolated_poses
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from sparsestyle_ns.core.camera_geometry import is_forward_facing, meeting_point
 from sparsestyle_ns.utils.errors import InputError
@@ -26,17 +23,14 @@ FLIGHT_STEPS = 20
 
 
 def measuring_path(cameras: Cameras) -> Cameras:
-    """The measuring path's cameras, one a frame, with the first training camera's lens, undistorted.
+    """The path on which consistency is measured, one camera a frame.
 
-    Where the training cameras look one way, the path leads from each to the next in their order, in steps of equal
-    parts; where they stand all around, it is an arc around the point that they look at, level with them on average,
-    in steps of 2° from the first one's side on.
-
-    Args:
-        cameras: the training cameras, two or more.
+    Where the training cameras look one way, it leads from each to the next in their order, in steps of equal parts;
+    where they stand all around, it is an arc around the point that they look at, level with them on average, in steps
+    of 2° from the first one's side on.
 
     Raises:
-        InputError: there are fewer than two.
+        InputError: there are fewer than two training cameras.
     """
     if len(cameras) < 2:
         raise InputError("Consistency is measured between training views, and there is one; train on two or more.")
@@ -45,14 +39,10 @@ def measuring_path(cameras: Cameras) -> Cameras:
 
 
 def showing_path(cameras: Cameras, frames: int) -> Cameras:
-    """A closed path that shows a scene, one camera a frame, with the first training camera's lens, undistorted.
+    """A closed path that shows a scene, one camera a frame; the last frame is just before the first.
 
-    Where the training cameras look one way, a flight through them there and back, which is slow where it turns; where
-    they stand all around, one full turn about the point that they look at, level with them on average.
-
-    Args:
-        cameras: the training cameras, two or more.
-        frames: how many; the last is just before the first.
+    Where the two or more training cameras look one way, a flight through them there and back, which is slow where it
+    turns; where they stand all around, one full turn as in `unseen_places`.
     """
     poses = cameras.camera_to_worlds.cpu().float()
     if not is_forward_facing(poses):
@@ -63,14 +53,10 @@ def showing_path(cameras: Cameras, frames: int) -> Cameras:
 
 
 def unseen_places(cameras: Cameras, count: int) -> Cameras:
-    """Cameras at equal steps where photos might have been taken, with the first training camera's lens, undistorted.
+    """So many cameras (a few more on a way) at equal steps where photos might have been taken.
 
-    Where the training cameras look one way, on the way from each to the next in their order; where they stand all
-    around, on the circle about the point that they look at, level with them on average.
-
-    Args:
-        cameras: the training cameras, two or more.
-        count: how many; a few more may be given on a way.
+    Where the two or more training cameras look one way, on the way from each to the next in their order; where they
+    stand all around, on the circle about the point that they look at, level with them on average.
     """
     # In float64, whose rounding, which differs with where vectors lie in memory, doesn't reach the float32 result.
     poses = cameras.camera_to_worlds.cpu().double()
@@ -108,9 +94,8 @@ def poses_around(
     radius = offsets[:, :2].norm(dim=-1).mean()
     start = torch.atan2(offsets[0, 1], offsets[0, 0])
     angles = start + step * torch.arange(frames, dtype=poses.dtype)
-    positions = center + torch.stack(
-        [radius * torch.cos(angles), radius * torch.sin(angles), height.expand(frames)], dim=-1
-    )
-    back = torch.nn.functional.normalize(positions - center, dim=-1)
-    right = torch.nn.functional.normalize(torch.linalg.cross(back.new_tensor([[0.0, 0.0, 1.0]]), back), dim=-1)
+    circle = [radius * torch.cos(angles), radius * torch.sin(angles), height.expand(frames)]
+    positions = center + torch.stack(circle, dim=-1)
+    back = normalize(positions - center, dim=-1)
+    right = normalize(torch.linalg.cross(back.new_tensor([[0.0, 0.0, 1.0]]), back), dim=-1)
     return torch.stack([right, torch.linalg.cross(back, right), back, positions], dim=-1)

@@ -27,29 +27,6 @@ MIN_FORWARD = 1e-6
 exist; and smallest -z / n of a point with an image in NDC."""
 
 
-def ndc_points(
-    points: Float[Tensor, "*batch 3"], focal_over_half_size: tuple[float, float], near: float = 1.0
-) -> Float[Tensor, "*batch 3"]:
-    """Images of world points in NDC: (-(2f/w) x/z, -(2f/h) y/z, 1 + 2n/z).
-
-    The near plane z = -n lands on z' = -1 and infinity on z' = 1. Points between the camera plane z = 0 and the near
-    plane land below z' = -1. A point on or behind the camera plane has no image: its z is taken to be -1e-6 n, which
-    gives a finite point far outside the box.
-
-    Args:
-        points: world points, with the scene along -z.
-        focal_over_half_size: (2f/w, 2f/h), the focal length over half the image's width and height.
-        near: n, the near plane's distance from z = 0 in world units, above 0.
-
-    Returns:
-        The points in NDC.
-    """
-    x, y, z = points.unbind(-1)
-    z = z.clamp(max=-MIN_FORWARD * near)
-    scale_x, scale_y = focal_over_half_size
-    return torch.stack([-scale_x * x / z, -scale_y * y / z, 1 + 2 * near / z], dim=-1)
-
-
 def ndc_rays(
     origins: Float[Tensor, "*batch 3"],
     directions: Float[Tensor, "*batch 3"],
@@ -67,8 +44,7 @@ def ndc_rays(
     (o_z < -n) starts behind its origin; `ndc_distance` is negative on that first stretch.
 
     Args:
-        origins: o, in the world.
-        directions: d, in the world, of any length.
+        origins, directions: o and d, in the world; d of any length.
         focal_over_half_size: (2f/w, 2f/h), the focal length over half the image's width and height.
         near: n, the near plane's distance from z = 0 in world units, above 0.
 
@@ -94,15 +70,12 @@ def ndc_distance(
 ) -> Float[Tensor, "*batch 1"]:
     """Distance along the world ray of the point o' + t' d' that `ndc_rays` gives for that ray.
 
-    The point's depth is z = -n / (1 - t') (NeRF, appendix C), and the distance (z - o_z) / d_z is
-    measured from the ray's own origin, before its move to the near plane, in units of the direction's length: world
-    units where it is a unit vector.
+    The point's depth is z = -n / (1 - t') (NeRF, appendix C), and the distance (z - o_z) / d_z is measured from the
+    ray's own origin, before its move to the near plane, in units of the direction's length.
 
     Args:
         t_ndc: t', 0 on the near plane and 1 at infinity.
-        origins: o, in the world, as given to `ndc_rays`.
-        directions: d, in the world, as given to `ndc_rays`. Shapes are broadcast against each other.
-        near: n, as given to `ndc_rays`.
+        origins, directions, near: o, d and n, as given to `ndc_rays`. Shapes are broadcast against each other.
         max_distance: cap of the result. It is the result where t' >= 1, and no gradient flows there.
 
     Returns:

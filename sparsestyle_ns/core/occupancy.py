@@ -35,12 +35,7 @@ def grid_cells(positions: Float[Tensor, "*batch 3"], resolution: int) -> Int[Ten
 
 
 class DensityGrid(nn.Module):
-    """σ per cell of the cube [−1, 1]³.
-
-    Args:
-        resolution: cells along a side.
-        initial: σ before anything is known.
-    """
+    """σ per cell of the cube [−1, 1]³, `resolution` cells a side; `initial` before anything is known."""
 
     density: Float[Tensor, "cells"]
 
@@ -97,11 +92,7 @@ class DensityGrid(nn.Module):
 
 
 class Occupancy(nn.Module):
-    """Which cells of the cube hold anything of a frozen field.
-
-    Args:
-        resolution: cells along a side.
-    """
+    """Which cells of the cube, `resolution` a side, hold anything of a frozen field."""
 
     occupied: Bool[Tensor, "x y z"]
 
@@ -122,7 +113,6 @@ class Occupancy(nn.Module):
         """Marks the cells in which a ray would meet an opacity of at least `min_alpha`, and their neighbours.
 
         Args:
-            density: σ at field coordinates.
             min_alpha: smallest 1 − exp(−σ · cell side), at the cell's centre, that counts.
             chunk: points a call of `density`.
         """
@@ -143,19 +133,16 @@ class Occupancy(nn.Module):
 
 
 class PackedSamples(NamedTuple):
-    """Samples of a batch of rays in the packed layout (see `compositing`).
-
-    Attributes:
-        ray_indices: the ray each sample lies on, ascending; front to back on a ray.
-        s: middle of its interval, in [0, 1].
-        lengths: δ in field coordinates; infinite for the last interval of an unbounded space.
-        positions: field coordinates of the middle.
-    """
+    """Samples of a batch of rays in the packed layout (see `volrend`)."""
 
     ray_indices: Int[Tensor, "samples"]
+    """The ray each sample lies on, ascending; front to back on a ray."""
     s: Float[Tensor, "samples"]
+    """Middle of its interval, in [0, 1]."""
     lengths: Float[Tensor, "samples"]
+    """δ in field coordinates; infinite for the last interval of an unbounded space."""
     positions: Float[Tensor, "samples 3"]
+    """Field coordinates of the middle."""
 
     def select(self, keep: Tensor) -> "PackedSamples":
         """Some of the samples, in order, by mask or ascending indices."""

@@ -28,12 +28,9 @@ def multiplies_bfloat16(device: torch.device) -> bool:
 
 
 def autocast(device: torch.device, precision: Precision) -> AbstractContextManager:
-    """A context in which matrix products run in `precision`; parameters and sums stay float32.
-
-    `auto` is bfloat16 where the device multiplies it (`multiplies_bfloat16`), else float32.
-    """
+    """A context in which matrix products run in `precision`; parameters and sums stay float32."""
     if precision == "tf32":
-        return TENSOR_FLOAT32.allowed()
+        return _tf32_products()
     enabled = precision == "bfloat16" or (precision == "auto" and multiplies_bfloat16(device))
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=enabled)
 
@@ -43,35 +40,29 @@ def multiplies_tf32(device: torch.device) -> bool:
     return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
 
 
-class TensorFloat32:
-    """torch's switch for TF32 products, of which there is one for all threads.
+_lock, _within, _before = threading.Lock(), 0, False
 
-    It is on while any thread is within `allowed`, and afterwards as before. What another thread multiplies outside
-    meanwhile, such as a backward pass beside a viewer's picture, is multiplied in TF32 too.
+
+@contextmanager
+def _tf32_products() -> Iterator[None]:
+    """Turns on torch's switch for TF32 products, of which there is one for all threads; afterwards it is as before.
+
+    It is on while any thread is within. What another thread multiplies outside meanwhile, such as a backward pass
+    beside a viewer's picture, is multiplied in TF32 too.
     """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._within, self._before = 0, False
-
-    @contextmanager
-    def allowed(self) -> Iterator[None]:
-        """A context in which products run in TF32; several threads may be in it, and one several times."""
-        products = torch.backends.cuda.matmul
-        with self._lock:
-            if self._within == 0:
-                self._before, products.allow_tf32 = products.allow_tf32, True
-            self._within += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._within -= 1
-                if self._within == 0:
-                    products.allow_tf32 = self._before
-
-
-TENSOR_FLOAT32 = TensorFloat32()
+    global _within, _before
+    products = torch.backends.cuda.matmul
+    with _lock:
+        if _within == 0:
+            _before, products.allow_tf32 = products.allow_tf32, True
+        _within += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _within -= 1
+            if _within == 0:
+                products.allow_tf32 = _before
 
 
 def at_least_float32(values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

@@ -36,10 +36,7 @@ def content_weight(step: int, initial: float, decay: float, duration: int) -> fl
 def ramp(progress: float, start: float, length: float) -> float:
     """A share that rises evenly from 0 at `start` to 1 at `start + length`; a step where `length` is 0.
 
-    Args:
-        progress: share of the iterations that is over, 0 or more.
-        start: share of the iterations at which it begins to rise.
-        length: share of the iterations that it takes, 0 or more.
+    All three are shares of the iterations, 0 or more.
 
     Example:
         >>> ramp(0.5, start=0.25, length=0.5)

@@ -57,9 +57,7 @@ class LinearSegments(Segments):
 
     def positions(self, s: Tensor, ray_indices: Optional[Tensor] = None) -> Tensor:
         """See `Segments.positions`."""
-        if ray_indices is None:
-            return self.start[:, None] + s[..., None] * self.extent[:, None]
-        return self.start[ray_indices] + s[:, None] * self.extent[ray_indices]
+        return _points(self.start, self.extent, s, ray_indices)
 
     def lengths(self, edges: Tensor) -> Tensor:
         """See `Segments.lengths`."""
@@ -73,13 +71,14 @@ class ForwardFacingSegments(LinearSegments):
     origins: Float[Tensor, "rays 3"]
     directions: Float[Tensor, "rays 3"]
     near: float
-    first: float
-    last: float
+    first: Float[Tensor, "rays 1"]
+    last: Float[Tensor, "rays 1"]
 
     def distance(self, s: Tensor) -> Tensor:
         """See `Segments.distance`."""
         t_ndc = self.first + s * (self.last - self.first)
-        return ndc_distance(t_ndc, self.origins, self.directions, self.near, max_distance=MAX_DISTANCE * self.near)
+        distance = ndc_distance(t_ndc, self.origins, self.directions, self.near, MAX_DISTANCE * self.near)
+        return distance.clamp(min=0.0)  # a ray may start at its own origin, but for rounding
 
     def at_distance(self, distance: Tensor) -> Tensor:
         """See `Segments.at_distance`."""
@@ -135,16 +134,19 @@ class ContractedSegments(Segments):
 
     def positions(self, s: Tensor, ray_indices: Optional[Tensor] = None) -> Tensor:
         """See `Segments.positions`."""
-        if ray_indices is None:
-            points = self.origins[:, None] + self._distance_in_units(s)[..., None] * self.directions[:, None]
-        else:
-            points = self.origins[ray_indices] + self._distance_in_units(s)[:, None] * self.directions[ray_indices]
-        return contract(points)
+        return contract(_points(self.origins, self.directions, self._distance_in_units(s), ray_indices))
 
     def lengths(self, edges: Tensor) -> Tensor:
         """See `Segments.lengths`; chords of the bent ray."""
         points = self.positions(edges)
         return (points[:, 1:] - points[:, :-1]).norm(dim=-1)
+
+
+def _points(origins: Tensor, directions: Tensor, t: Tensor, ray_indices: Optional[Tensor]) -> Tensor:
+    """o + t d of all rays, or of the rays `ray_indices`."""
+    if ray_indices is None:
+        return origins[:, None] + t[..., None] * directions[:, None]
+    return origins[ray_indices] + t[:, None] * directions[ray_indices]
 
 
 def _position_between(value: Tensor, first: Union[float, Tensor], last: Union[float, Tensor]) -> Tensor:
@@ -180,13 +182,10 @@ def intersect_box(
     maximum: Float[Tensor, "3"],
     near: Union[float, Float[Tensor, ""]] = 0.0,
 ) -> Tuple[Float[Tensor, "rays 1"], Float[Tensor, "rays 1"], Bool[Tensor, "rays"]]:
-    """Distances at which rays enter and leave an axis-aligned box (the slab method).
+    """Distances at which rays enter and leave an axis-aligned box, and whether they meet it (the slab method).
 
-    Args:
-        near: rays start no closer than this, so that a camera may stand in the box.
-
-    Returns:
-        Entry and exit distance, and whether the ray meets the box. Where it doesn't, both distances are `near`.
+    Rays start no closer than `near`, so that a camera may stand in the box. Where they miss it, both distances are
+    `near`.
     """
     tiny = torch.finfo(directions.dtype).tiny
     safe = torch.where(directions.abs() < tiny, torch.full_like(directions, tiny), directions)
@@ -244,27 +243,28 @@ class ForwardFacingSpace(Space):
     def segments(self, origins: Tensor, directions: Tensor) -> ForwardFacingSegments:
         """See `Space.segments`."""
         start, extent, valid = ndc_rays(origins, directions, self.focal_over_half_size, self.near)
-        hit = valid.squeeze(-1)
+        # A camera that has flown past the nearest thing doesn't see what is behind it, and past the farthest, nothing.
+        own = ndc_parameter(torch.zeros_like(origins[:, :1]), origins, directions, self.near)
+        first, last = own.clamp(min=self.first), own.clamp(min=self.last)
+        hit = (valid & (first < last)).squeeze(-1)
         size = self.maximum - self.minimum
         scale = 2.0 / torch.where(size > 0, size, 2.0)
         return ForwardFacingSegments(
-            start=(start + self.first * extent - self.minimum) * scale - 1.0,
-            extent=(self.last - self.first) * extent * scale * hit[:, None],
+            start=(start + first * extent - self.minimum) * scale - 1.0,
+            extent=(last - first) * extent * scale * hit[:, None],
             hit=hit,
             origins=origins,
             directions=directions,
             near=self.near,
-            first=self.first,
-            last=self.last,
+            first=first,
+            last=last,
         )
 
 
 class BoxSpace(Space):
-    """An axis-aligned box in world coordinates, for an object with nothing behind it.
+    """An axis-aligned box in world coordinates, for an object with nothing behind it; its longest side is the cube's.
 
-    Args:
-        box: the box; its longest side becomes the cube's.
-        near: rays start no closer to the camera than this, in half sides of the cube.
+    Rays start no closer to the camera than `near`, in half sides of the cube.
     """
 
     unbounded = False
@@ -294,17 +294,14 @@ class BoxSpace(Space):
 class ContractedSpace(Space):
     """All of space, contracted, for cameras all around and a background beyond them.
 
-    Args:
-        unit: the length in the world, above 0, that the contraction takes as 1: coordinates below it aren't bent.
-        near: distance at which rays start, in that unit.
+    Coordinates below `unit`, a length in the world above 0, aren't bent. Rays start at `near` of that unit.
     """
 
     unbounded = True
 
     def __init__(self, unit: float = 1.0, near: float = 0.05) -> None:
         super().__init__()
-        self.unit = unit
-        self.near = near
+        self.unit, self.near = unit, near
 
     def segments(self, origins: Tensor, directions: Tensor) -> ContractedSegments:
         """See `Space.segments`."""

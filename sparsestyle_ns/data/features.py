@@ -1,7 +1,7 @@
-"""SIFT features of photos (Lowe 2004), and which features of two photos look alike."""
+"""SIFT features of photos (Lowe 2004), which features of two photos look alike, and which photos that links."""
 
 from dataclasses import dataclass
-from typing import Tuple
+from typing import Iterable, List, Set, Tuple
 
 import cv2
 import numpy as np
@@ -39,6 +39,15 @@ def find_features(grey: UInt8[np.ndarray, "H W"], count: int, min_contrast: floa
     # Square roots of the L1-normalised descriptor: Hellinger's distance (Arandjelović and Zisserman 2012).
     descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
     return Features(np.array([keypoint.pt for keypoint in keypoints]), descriptors)
+
+
+def linked_groups(count: int, links: Iterable[Tuple[int, int]]) -> List[Set[int]]:
+    """Groups of photos, 0 to count − 1, that are linked to each other, directly or by way of others."""
+    groups = [{photo} for photo in range(count)]
+    for link in links:
+        joined = [group for group in groups if group & set(link)]
+        groups = [group for group in groups if group not in joined] + [set.union(*joined)]
+    return groups
 
 
 def mutual_matches(

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from nerfstudio.cameras.camera_utils import radial_and_tangential_undistort
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from sparsestyle_ns.data.features import Features, find_features, mutual_matches
+from sparsestyle_ns.data.features import find_features, linked_groups, mutual_matches
 
 MAX_FEATURES, MIN_CONTRAST, MAX_RATIO = 2000, 0.02, 0.8
 """Of the matcher (`features`); lenient, as the known cameras sort out wrong matches."""
@@ -31,35 +31,28 @@ NEAREST_VIEWS = 6
 
 @dataclass
 class PointMatches:
-    """Points seen in two photos.
+    """Points seen in two photos; the first axis of each array is for the one photo and the other.
 
     Attributes:
-        first, second: which photos.
-        colors_first, colors_second: RGB there, in [0, 1].
-        directions_first, directions_second: unit vectors in the world, from the cameras to the point.
+        views: which photos.
+        colors: RGB there, in [0, 1].
+        directions: unit vectors in the world, from the cameras to the point.
         num_views: photos in all.
     """
 
-    first: Int[np.ndarray, "matches"]
-    second: Int[np.ndarray, "matches"]
-    colors_first: Float[np.ndarray, "matches 3"]
-    colors_second: Float[np.ndarray, "matches 3"]
-    directions_first: Float[np.ndarray, "matches 3"]
-    directions_second: Float[np.ndarray, "matches 3"]
+    views: Int[np.ndarray, "2 matches"]
+    colors: Float[np.ndarray, "2 matches 3"]
+    directions: Float[np.ndarray, "2 matches 3"]
     num_views: int
 
     def __len__(self) -> int:
-        return len(self.first)
+        return self.views.shape[1]
 
     def fewest_in_a_view(self) -> int:
-        """Matches of the photo that has fewest; 0 where some photos hang together with the others by none."""
-        counts = np.zeros((self.num_views, self.num_views), dtype=int)
-        np.add.at(counts, (self.first, self.second), 1)
-        counts += counts.T
-        reached = np.eye(self.num_views, dtype=bool)
-        for _ in range(self.num_views):
-            reached = reached | (reached @ (counts > 0))
-        return int(counts.sum(axis=1).min()) if reached.all() else 0
+        """Matches of the photo that has fewest; 0 where matches don't link all photos to each other."""
+        if len(linked_groups(self.num_views, np.unique(self.views, axis=1).T.tolist())) > 1:
+            return 0
+        return int(np.bincount(self.views.ravel(), minlength=self.num_views).min())
 
 
 @dataclass
@@ -81,18 +74,20 @@ class PixelRays:
 
 @dataclass
 class _View:
-    """A photo whose points can be matched.
+    """The features of a photo: what they look like, and what is known of each.
 
     Attributes:
-        features: of the photo.
+        descriptors: see `Features`.
         rays: where the camera sees them.
-        blurred: the photo, for colours.
+        directions: the same as unit vectors in the world.
+        rgba: colours there, of the blurred photo.
         pixel: side of a pixel over the focal length.
     """
 
-    features: Features
+    descriptors: Float[np.ndarray, "features 128"]
     rays: PixelRays
-    blurred: Float[np.ndarray, "H W 4"]
+    directions: Float[np.ndarray, "features 3"]
+    rgba: Float[np.ndarray, "features 4"]
     pixel: float
 
 
@@ -103,32 +98,27 @@ def match_points(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras)
         photos: RGBA in [0, 1].
         cameras: one for each, for images of any size with the same aspect.
     """
-    views = [_look_at(photo, cameras, index) for index, photo in enumerate(photos)]
     poses = cameras.camera_to_worlds.double().numpy()
-    found: List[Tuple[np.ndarray, ...]] = []
-    for first, second in neighbouring_pairs(poses):
-        one, other = views[first], views[second]
-        if one is None or other is None:
+    seen = [_look_at(photo, cameras, index) for index, photo in enumerate(photos)]
+    views, colors, directions = [np.zeros((2, 0), int)], [np.zeros((2, 0, 3))], [np.zeros((2, 0, 3))]
+    for pair in neighbouring_pairs(poses):
+        both = [seen[index] for index in pair]
+        if None in both:
             continue
-        here, there = mutual_matches(one.features.descriptors, other.features.descriptors, MAX_RATIO)
-        error = epipolar_error(one.rays[here], other.rays[there], poses[first], poses[second])
-        fits = error < MAX_EPIPOLAR_ERROR * max(one.pixel, other.pixel)
-        here, there = here[fits], there[fits]
-        colors = sample(one.blurred, one.features.points[here]), sample(other.blurred, other.features.points[there])
-        directions = (
-            in_world(one.rays.directions[here], poses[first]),
-            in_world(other.rays.directions[there], poses[second]),
-        )
-        opaque = (colors[0][:, 3] > 0.99) & (colors[1][:, 3] > 0.99)
-        numbers = np.full(len(here), first), np.full(len(here), second)
-        found.append((*(each[opaque] for each in numbers), *(each[opaque, :3] for each in (*colors, *directions))))
-    empty = (np.zeros(0, int), np.zeros(0, int), *(np.zeros((0, 3)) for _ in range(4)))
-    columns = [np.concatenate(parts) for parts in zip(empty, *found, strict=True)]
-    return PointMatches(*columns, num_views=len(photos))
+        rows = mutual_matches(*(view.descriptors for view in both), MAX_RATIO)
+        matched = list(zip(both, rows, strict=True))
+        rgba = np.stack([view.rgba[row] for view, row in matched])
+        error = epipolar_error(*(view.rays[row] for view, row in matched), *poses[list(pair)])
+        good = (error < MAX_EPIPOLAR_ERROR * max(view.pixel for view in both)) & (rgba[..., 3] > 0.99).all(axis=0)
+        views.append(np.repeat(np.array(pair)[:, None], good.sum(), axis=1))
+        colors.append(rgba[:, good, :3])
+        directions.append(np.stack([view.directions[row[good]] for view, row in matched]))
+    joined = (np.concatenate(parts, axis=1) for parts in (views, colors, directions))
+    return PointMatches(*joined, num_views=len(photos))
 
 
 def _look_at(photo: Float[np.ndarray, "H W 4"], cameras: Cameras, index: int) -> Optional[_View]:
-    """What matching needs of a photo; None where its camera is no `LENSES`."""
+    """The features of a photo; None where its camera is no `LENSES`."""
     kind = CameraType(int(cameras.camera_type[index]))
     if kind not in LENSES:
         return None
@@ -139,37 +129,26 @@ def _look_at(photo: Float[np.ndarray, "H W 4"], cameras: Cameras, index: int) ->
     focal = np.array([float(cameras.fx[index]), float(cameras.fy[index])])
     at = ((0.5 + features.points) * pixels - center) / focal
     rays = rays_of(undistorted(at, cameras, index), kind)
-    return _View(features, rays, cv2.GaussianBlur(photo, (0, 0), BLUR), pixels / focal.mean())
-
-
-def in_world(rays: Float[np.ndarray, "points 3"], pose: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "points 3"]:
-    """Unit directions in the world, of directions in a camera."""
-    directions = rays @ pose[:, :3].T
-    return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    directions = rays.directions @ cameras.camera_to_worlds[index, :, :3].double().numpy().T
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    rgba = sample(cv2.GaussianBlur(photo, (0, 0), BLUR), features.points)
+    return _View(features.descriptors, rays, directions, rgba, pixels / focal.mean())
 
 
 def distances_along(
-    origins_first: Float[np.ndarray, "rays 3"],
-    directions_first: Float[np.ndarray, "rays 3"],
-    origins_second: Float[np.ndarray, "rays 3"],
-    directions_second: Float[np.ndarray, "rays 3"],
-) -> Tuple[Float[np.ndarray, "rays"], Float[np.ndarray, "rays"]]:
+    origins: Float[np.ndarray, "2 rays 3"], directions: Float[np.ndarray, "2 rays 3"]
+) -> Float[np.ndarray, "2 rays"]:
     """Where two rays of unit direction come nearest to each other: the distance from either's origin.
 
     Infinite where they are parallel; negative where they come nearest behind an origin.
     """
-    between = origins_first - origins_second
-    cosine = (directions_first * directions_second).sum(axis=-1)
+    cosine = directions.prod(axis=0).sum(axis=-1)
     # 1 − cos² without its cancellation for rays that are nearly parallel.
-    square_of_sine = (np.cross(directions_first, directions_second) ** 2).sum(axis=-1)
-    along_first, along_second = (
-        (direction * between).sum(axis=-1) for direction in (directions_first, directions_second)
-    )
+    square_of_sine = (np.cross(*directions) ** 2).sum(axis=-1)
+    first, second = (directions * (origins[0] - origins[1])).sum(axis=-1)
+    along = np.stack([cosine * second - first, second - cosine * first])
     parallel = square_of_sine < 1e-12
-    safe = np.where(parallel, 1.0, square_of_sine)
-    first = np.where(parallel, np.inf, (cosine * along_second - along_first) / safe)
-    second = np.where(parallel, np.inf, (along_second - cosine * along_first) / safe)
-    return first, second
+    return np.where(parallel, np.inf, along / np.where(parallel, 1.0, square_of_sine))
 
 
 def neighbouring_pairs(poses: Float[np.ndarray, "views 3 4"]) -> List[Tuple[int, int]]:

@@ -47,12 +47,13 @@ def parse_dataparser(words: Sequence[str], data: Path) -> DataParserConfig:
     Raises:
         InputError: there is no such dataparser or scene, or nothing tells which dataparser reads it.
     """
-    from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion  # which loads this package's llff-data
+    # Imported here, as nerfstudio's table of dataparsers loads this package's llff-data, which needs `advice`.
+    from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion, all_dataparsers
 
-    if words:
-        check_parser(words[0])
+    if words and words[0] not in all_dataparsers:
+        raise InputError(f"There is no dataparser {words[0]}; name one of {', '.join(sorted(all_dataparsers))}.")
     if not data.exists():
-        raise InputError(f"There is no {data}; name a scene's folder with --data.")
+        raise InputError(f"There is no scene at --data {data}; name its folder.")
     if not words:
         marker = marker_of(data)
         if marker is None:
@@ -61,15 +62,3 @@ def parse_dataparser(words: Sequence[str], data: Path) -> DataParserConfig:
             )
         words = [MARKERS[marker]]
     return tyro.cli(AnnotatedDataParserUnion, args=list(words), prog="sparsestyle")
-
-
-def check_parser(name: str) -> None:
-    """Makes sure that there is a dataparser of a name.
-
-    Raises:
-        InputError: there isn't.
-    """
-    from nerfstudio.configs.dataparser_configs import all_dataparsers  # which loads this package's llff-data
-
-    if name not in all_dataparsers:
-        raise InputError(f"There is no dataparser {name}; name one of {', '.join(sorted(all_dataparsers))}.")

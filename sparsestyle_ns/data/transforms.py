@@ -11,11 +11,11 @@ from sparsestyle_ns.data.parser_choice import advice
 from sparsestyle_ns.utils.errors import InputError
 
 LENGTHS = ("fl_x", "fl_y", "w", "h")
-"""What a file of nerfstudio's gives in pixels, above 0, for all cameras or in a frame for its own."""
+"""Entries in pixels, above 0, for all cameras or, in a frame, for its own."""
 NUMBERS = ("cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
-"""What it gives as any number."""
+"""Entries that are any number."""
 ANGLE = "camera_angle_x"
-"""The horizontal angle of view in radians."""
+"""Entry for the horizontal angle of view, in radians."""
 
 
 def read_transforms(path: Path, with_angle: bool) -> Dict[str, Any]:

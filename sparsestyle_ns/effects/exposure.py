@@ -27,11 +27,11 @@ def fit_gains(matches: PointMatches) -> Tuple[Float[np.ndarray, "views 3"], Floa
     The gains minimise the sum of absolute differences (iteratively reweighted least squares), with a mean of zero over
     the photos in each channel.
     """
-    ratios = np.log((matches.colors_second + DARK) / (matches.colors_first + DARK))
+    ratios = np.log((matches.colors[1] + DARK) / (matches.colors[0] + DARK))
     rows = np.arange(len(matches))
     design = np.zeros((len(matches) + 1, matches.num_views))
-    design[rows, matches.second] += 1.0
-    design[rows, matches.first] -= 1.0
+    design[rows, matches.views[1]] += 1.0
+    design[rows, matches.views[0]] -= 1.0
     design[-1] = 1.0
     gains = np.zeros((matches.num_views, 3))
     for channel in range(3):

@@ -33,7 +33,7 @@ def measure_box(scene: Scene) -> Measurement:
         return Measurement(False, "the dataparser gives a box in NDC only", **found, possible=False)
     if scene.empty_border < MIN_EMPTY_BORDER:
         return Measurement(False, "of the photos' border is empty: there is something behind the subject", **found)
-    low, high = scene.scene_box
+    low, high = scene.outputs.scene_box.aabb
     point = meeting_point(scene.cameras.camera_to_worlds)
     if not ((low < point) & (point < high)).all():
         words = "of the photos' border is empty, but the cameras don't look into the scene box"

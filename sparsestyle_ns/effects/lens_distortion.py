@@ -15,18 +15,18 @@ def largest_shift(cameras: Cameras) -> float:
     """How far, in pixels, distortion moves the point of an image's border that it moves most; 0 without any."""
     if cameras.distortion_params is None or not cameras.distortion_params.any():
         return 0.0
-    shift = 0.0
     around = np.linspace(-1.0, 1.0, 9)
     sides = [np.stack([around, np.full(9, side)], axis=-1) for side in (-1.0, 1.0)]
     rim = np.concatenate([*sides, *(side[:, ::-1] for side in sides)])
+    shifts = []
     for index in range(len(cameras)):
         focal = np.array([float(cameras.fx[index]), float(cameras.fy[index])])
         center = np.array([float(cameras.cx[index]), float(cameras.cy[index])])
         half = 0.5 * np.array([float(cameras.width[index]), float(cameras.height[index])])
         points = (half + rim * half - center) / focal
         moved = (undistorted(points, cameras, index) - points) * focal
-        shift = max(shift, float(np.linalg.norm(moved, axis=-1).max()))
-    return shift
+        shifts.append(float(np.linalg.norm(moved, axis=-1).max()))
+    return max(shifts)
 
 
 def measure_lens_distortion(scene: Scene) -> Measurement:

@@ -4,7 +4,7 @@ Stage 1 learns that rays to such points end there (DS-NeRF's idea, Deng et al. 2
 """
 
 from dataclasses import dataclass
-from typing import Optional, Tuple
+from typing import Optional
 
 import numpy as np
 import torch
@@ -44,19 +44,13 @@ def triangulate(scene: Scene) -> MatchedRays:
     Points are where the two rays come nearest to each other.
     """
     matches, poses = scene.matches, scene.cameras.camera_to_worlds.double().numpy()
-    photos = np.array(scene.matched_views, dtype=int)
-    views = photos[matches.first], photos[matches.second]
-    origins = poses[views[0], :, 3], poses[views[1], :, 3]
-    directions = matches.directions_first, matches.directions_second
-    distances = distances_along(origins[0], directions[0], origins[1], directions[1])
-    ahead = np.isfinite(distances[0]) & (distances[0] > 0) & (distances[1] > 0)
-
-    def of_both(parts: Tuple[np.ndarray, np.ndarray]) -> Tensor:
-        return torch.from_numpy(np.concatenate([part[ahead] for part in parts]))
-
-    return MatchedRays(
-        of_both(origins).float(), of_both(directions).float(), of_both(distances).float()[:, None], of_both(views)
-    )
+    views = np.array(scene.matched_views, dtype=int)[matches.views]
+    origins = poses[views, :, 3]
+    distances = distances_along(origins, matches.directions)
+    ahead = (np.isfinite(distances) & (distances > 0)).all(axis=0)
+    parts = (origins, matches.directions, distances[..., None])
+    rays = (torch.from_numpy(part[:, ahead].reshape(-1, part.shape[-1])).float() for part in parts)
+    return MatchedRays(*rays, views=torch.from_numpy(views[:, ahead].reshape(-1)))
 
 
 def measure_matched_depth(scene: Scene) -> Measurement:

@@ -33,51 +33,37 @@ SAME_COLOR = 6 / 255
 
 @dataclass
 class Scene:
-    """A scene's training views, as a dataparser gives them.
+    """A scene's training views.
 
     Attributes:
-        filenames: the photos.
-        cameras: their cameras.
-        scene_box: lower and upper corner of the dataparser's box.
-        ndc: the dataparser's map to NDC, in which the box then is; None where it gives none.
-        alpha_color: RGB that it puts behind transparent photos; None where it doesn't.
+        outputs: what the dataparser says of them, as read by `read_scene`.
         coarse_density: σ_c at field coordinates, once there is a coarse field.
         style_image: the painting, once it is known.
     """
 
-    filenames: List[Path]
-    cameras: Cameras
-    scene_box: Float[Tensor, "2 3"]
-    ndc: Optional[NDC] = None
-    alpha_color: Optional[Float[Tensor, "3"]] = None
+    outputs: DataparserOutputs
     coarse_density: Optional[Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]] = None
     style_image: Optional[Float[Tensor, "3 H W"]] = None
 
-    @classmethod
-    def of(cls, outputs: DataparserOutputs) -> "Scene":
-        """The scene of a dataparser's outputs."""
-        return cls(
-            filenames=list(outputs.image_filenames),
-            cameras=outputs.cameras,
-            scene_box=outputs.scene_box.aabb,
-            ndc=scene_info(outputs).ndc,
-            alpha_color=outputs.alpha_color,
-        )
+    @property
+    def cameras(self) -> Cameras:
+        """The photos' cameras."""
+        return self.outputs.cameras
 
     @property
-    def num_views(self) -> int:
-        """Training views."""
-        return len(self.filenames)
+    def ndc(self) -> Optional[NDC]:
+        """The map to NDC, in which the scene box then is; None where the dataparser gives none."""
+        return scene_info(self.outputs).ndc
 
     @cached_property
     def photos(self) -> List[Float[np.ndarray, "H W 4"]]:
         """RGBA in [0, 1], not premultiplied, at most `LONGEST_SIDE` pixels along the longer side."""
-        return [read_rgba(path) for path in self.filenames]
+        return [read_rgba(path) for path in self.outputs.image_filenames]
 
     @cached_property
     def transparent(self) -> bool:
         """Whether photos have transparency, and the dataparser a colour to put behind it."""
-        return self.alpha_color is not None and any((photo[..., 3] < 1.0).any() for photo in self.photos)
+        return self.outputs.alpha_color is not None and any((photo[..., 3] < 1.0).any() for photo in self.photos)
 
     @cached_property
     def empty_border(self) -> float:
@@ -91,19 +77,19 @@ class Scene:
     def background_color(self) -> List[float]:
         """RGB behind the scene: the dataparser's for transparent photos, else the border's median."""
         if self.transparent:
-            return [float(value) for value in self.alpha_color]
+            return [float(value) for value in self.outputs.alpha_color]
         return np.median(np.concatenate([border(photo)[:, :3] for photo in self.photos]), axis=0).tolist()
 
     @cached_property
     def matches(self) -> PointMatches:
-        """Points that are seen in two of `matched_views`, which are what it numbers the photos by."""
+        """Points that are seen in two of `matched_views`; photos are numbered by their places there."""
         chosen = self.matched_views
         return match_points([self.photos[index] for index in chosen], self.cameras[torch.tensor(chosen)])
 
     @property
     def matched_views(self) -> List[int]:
         """Photos among which points are matched: at most `MATCHED_VIEWS`, evenly spaced."""
-        return list(evenly_spaced(self.num_views, MATCHED_VIEWS))
+        return list(evenly_spaced(len(self.cameras), MATCHED_VIEWS))
 
 
 def read_rgba(path: Path) -> Float[np.ndarray, "H W 4"]:

@@ -7,7 +7,7 @@ from sparsestyle_ns.effects.exposure import DARK, fit_gains, not_measurable
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_VIEWS = 6
-"""Photos below which shine can't be told from shape (README, Where we depart from the paper)."""
+"""Photos below which shine can't be told from shape (docs/method.md)."""
 NOISE = 0.05
 """Difference of matched colours, of a range of 1, that noise and inexact matches explain."""
 MIN_SHARE = 0.08
@@ -21,11 +21,12 @@ def measure_view_color(scene: Scene) -> Measurement:
         return Measurement(False, unknown, None, MIN_SHARE)
     _, unexplained = fit_gains(matches)
     # A log ratio r of two colours with the mean m is a difference of about r m.
-    differences = np.abs(unexplained) * (0.5 * (matches.colors_first + matches.colors_second) + DARK)
+    differences = np.abs(unexplained) * (matches.colors.mean(axis=0) + DARK)
     share = float((differences.mean(axis=-1) > NOISE).mean())
     words, on = f"of {len(matches)} matched points change colour with the view", share >= MIN_SHARE
-    if on and scene.num_views < MIN_VIEWS:
-        words += f", but {scene.num_views} photos are too few to tell shine from shape; {MIN_VIEWS} are needed"
+    num_views = len(scene.cameras)
+    if on and num_views < MIN_VIEWS:
+        words += f", but {num_views} photos are too few to tell shine from shape; {MIN_VIEWS} are needed"
         on = False
     return Measurement(on, words, share, MIN_SHARE)
 

@@ -1,6 +1,5 @@
 """What a run looks like while it is trained: one held-out view, the same each time, beside its photo."""
 
-import io
 from pathlib import Path
 from typing import FrozenSet, Sequence
 
@@ -14,17 +13,11 @@ from sparsestyle_ns.evaluation.held_out import exact_outputs
 from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
-
-FOLDER = "previews"
-"""In a run's folder."""
+from sparsestyle_ns.utils.progress import say
 
 
 def preview_steps(shares: Sequence[float], total: int) -> FrozenSet[int]:
-    """The numbers of iterations after which a preview is due.
-
-    Args:
-        shares: of all iterations, in (0, 1].
-        total: all iterations.
+    """The numbers of iterations, of `total`, after which a preview is due, from shares of them in (0, 1].
 
     Raises:
         InputError: a share isn't in that range.
@@ -39,11 +32,7 @@ def preview_steps(shares: Sequence[float], total: int) -> FrozenSet[int]:
 def render_preview(pipeline: CheckedPipeline, longest_side: int) -> Float[Tensor, "H W 3"]:
     """The middle one of the held-out views: photo, unstylised render where there is one, and render, side by side.
 
-    Rendered exactly, and without leaving a trace in the state of training.
-
-    Args:
-        pipeline: of either method.
-        longest_side: pixels of the view's longer side, at most.
+    Rendered exactly, at `longest_side` pixels at most, and without leaving a trace in the state of training.
     """
     model, dataset = pipeline.model, pipeline.datamanager.eval_dataset
     index = len(dataset) // 2
@@ -61,17 +50,15 @@ def render_preview(pipeline: CheckedPipeline, longest_side: int) -> Float[Tensor
     return torch.cat([photo, *renders], dim=1)
 
 
-def save_preview(picture: Float[Tensor, "H W 3"], run: Path, iterations: int) -> Path:
-    """Writes a preview into a run's folder; returns the file.
-
-    Raises:
-        OSError: it can't be written.
-    """
-    buffer = io.BytesIO()
-    Image.fromarray(to8b(picture).cpu().numpy()).save(buffer, "PNG")
-    return write_whole(preview_path(run, iterations), buffer.getvalue())
-
-
 def preview_path(run: Path, iterations: int) -> Path:
     """Where the preview after so many iterations is, in a run's folder."""
-    return run / FOLDER / f"after-{iterations:06d}.png"
+    return run / "previews" / f"after-{iterations:06d}.png"
+
+
+def save_preview(picture: Float[Tensor, "H W 3"], run: Path, iterations: int) -> None:
+    """Writes a preview into the folder previews of a run; where that can't be done, says so."""
+    image = Image.fromarray(to8b(picture).cpu().numpy())
+    try:
+        write_whole(preview_path(run, iterations), lambda file: image.save(file, "PNG"))
+    except OSError as error:
+        say(f"The preview after {iterations} iterations can't be saved ({error.strerror}); training goes on.")

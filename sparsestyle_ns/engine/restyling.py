@@ -9,21 +9,22 @@ import copy
 import shutil
 import tempfile
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
-from typing import ContextManager, Dict, Iterator, Optional
+from typing import ContextManager, Dict, Iterator, NamedTuple, Optional
 
 import torch
 import yaml
 from torch import Tensor, nn
 
-from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import decide_again
-from sparsestyle_ns.engine.style_trainer import HierStyleTrainerConfig
-from sparsestyle_ns.engine.training_step import check_skipped, training_step, warm_start
+from sparsestyle_ns.engine.style_trainer import style_notes
+from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
+from sparsestyle_ns.engine.training import check_skipped, training_step, warm_start
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleInputs, StyleTask
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path, write_checkpoint
+from sparsestyle_ns.runs.run_folder import read_config
 from sparsestyle_ns.runs.scene_record import FILE_NAME as SCENE_RECORD
 from sparsestyle_ns.runs.thumbnail import save_thumbnail
 from sparsestyle_ns.style.backbone import Backbone
@@ -36,29 +37,22 @@ from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 
 SEED = 42
 """Of a new field's weights; nerfstudio's own."""
-RESIDUAL = "_model.residual."
-"""What the names of a stylised field's tensors start with in a checkpoint."""
 BESIDE_CHECKPOINTS = (SCENE_RECORD, "dataparser_transforms.json")
 """Files of a run that say nothing of the style."""
 PAINTING_FOLDER = "style_image"
 """Of a run's folder, where its painting lies under the name that it came with: no name can be that of another file."""
 
 
-@dataclass(frozen=True)
-class Progress:
-    """How far a restyling is.
-
-    Attributes:
-        words: what it is doing.
-        done: the share of all its steps that are done, in [0, 1].
-        seconds_left: a guess; None before the first iteration.
-        losses: those of the last iteration by name, not weighted, and `lambda` (Eq. 6); None before the first.
-    """
+class Progress(NamedTuple):
+    """How far a restyling is."""
 
     words: str
     done: float = 0.0
+    """The share of all its steps, in [0, 1]."""
     seconds_left: Optional[float] = None
+    """A guess; None before the first iteration."""
     losses: Optional[Dict[str, float]] = None
+    """Those of the last iteration by name, not weighted, and `lambda` (Eq. 6); None before the first."""
 
 
 class Workshop:
@@ -79,25 +73,20 @@ class Workshop:
         self.pipeline, self.folder, self.lock = pipeline, folder, lock
         self._backbone: Optional[Backbone] = None
 
-    def config(self) -> HierStyleTrainerConfig:
+    def config(self) -> SparseStyleTrainerConfig:
         """The run's config, with the optimiser, the schedule and the number of iterations.
 
         Raises:
             InputError: it isn't there or can't be read.
         """
-        path = self.folder / "config.yml"
-        try:
-            return yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
-        except Exception as error:  # yaml builds arbitrary objects, so anything can go wrong in it
-            raise InputError(f"{path} can't be read ({error}); restyling takes the run's settings from it.") from error
+        return read_config(self.folder)
 
     def backbone(self) -> Backbone:
         """The feature network that the pipeline has, else one with the weights that it would take."""
         if self.pipeline.targets is not None:
             return self.pipeline.targets.backbone
         if self._backbone is None:
-            settings = self.pipeline.config
-            self._backbone = settings.load_backbone(self.pipeline.device)
+            self._backbone = self.pipeline.config.load_backbone(self.pipeline.device)
         return self._backbone
 
     def new_field(self) -> nn.Module:
@@ -134,15 +123,15 @@ class Restyling:
 
     def __iter__(self) -> Iterator[Progress]:
         yield Progress(f"Looking at {self.image.name}")
-        backbone = self.workshop.backbone()
-        targets = self.pipeline.config.targets_of(StyleInputs(self.image, backbone))
-        self.effects = self._decide()
-        if self.pipeline.scene_views is None:
+        pipeline, total = self.pipeline, self.iterations
+        targets = pipeline.config.targets_of(StyleInputs(self.image, self.workshop.backbone()), pipeline.device)
+        scene = replace(pipeline.datamanager.scene, style_image=self.image.pixels)
+        self.effects = decide_again(pipeline.effects, "palette", scene)  # what depends on the painting
+        if pipeline.scene_views is None:
             yield Progress("Preparing the views, which the next style won't need")
-        task = self.pipeline.new_task(self.field, targets, self.effects)
-        warm_up, total = self.pipeline.config.warm_start_steps, self.iterations
-        rate = self.config.optimizers["fields"]["optimizer"].lr
-        for step in warm_start(self.pipeline, task, rate):
+        task = pipeline.new_task(self.field, targets, self.effects)
+        warm_up = pipeline.config.warm_start_steps
+        for step in warm_start(pipeline, task, self.config.optimizers["fields"]["optimizer"].lr):
             yield Progress(f"Warm start, step {step + 1} of {warm_up}", (step + 1) / (warm_up + total))
         began = time.monotonic()
         for step in range(total):
@@ -151,11 +140,6 @@ class Restyling:
             done = (warm_up + step + 1) / (warm_up + total)
             yield Progress(f"Iteration {step + 1} of {total}", done, left, losses)
         self.field.requires_grad_(False)
-
-    def _decide(self) -> Decisions:
-        """The scene's effects, with that which depends on the painting decided anew."""
-        scene = replace(self.pipeline.datamanager.scene, style_image=self.image.pixels)
-        return decide_again(self.pipeline.effects, "palette", scene)
 
     def _step(self, task: StyleTask, step: int) -> Dict[str, float]:
         """One iteration, as the trainer makes it."""
@@ -168,7 +152,7 @@ class Restyling:
 
         training_step(self.optimizers, compute_losses, step)
         advice = "try another image, or a lower learning rate in the run's config.yml."
-        check_skipped(self.optimizers, self.config.max_skipped_steps, advice)
+        check_skipped(self.optimizers, self.config.max_skipped_steps, step, advice)
         return {name: float(value) for name, value in metrics.items()}
 
     def save(self) -> Path:
@@ -187,53 +171,40 @@ class Restyling:
         try:
             new = hidden / "run"  # not `hidden` itself, which nobody else may read
             new.mkdir()
-            painting = self._write_contents(new)
-            while True:
-                folder = runs / datetime.now().strftime("%Y-%m-%d_%H%M%S")  # as nerfstudio names them
-                self._write_config(new, folder.resolve(), painting)
-                try:
-                    return new.rename(folder)
-                except OSError:
-                    if not folder.exists():
-                        raise
-                    time.sleep(0.1)  # until the second is over in which another run began
+            self._write_contents(new)
+            while (folder := runs / datetime.now().strftime("%Y-%m-%d_%H%M%S")).exists():  # as nerfstudio names them
+                time.sleep(0.1)  # until the second is over in which another run began
+            self._write_config(new, folder.resolve())
+            return new.rename(folder)
         finally:
             shutil.rmtree(hidden, ignore_errors=True)
 
-    def _write_contents(self, new: Path) -> Path:
-        """Writes a run but for its config; returns where in it the painting lies."""
+    @property
+    def _painting(self) -> Path:
+        """Where the painting lies in a run."""
+        return Path(PAINTING_FOLDER) / safe_file_name(self.image.name, "painting")
 
-        painting = Path(PAINTING_FOLDER) / safe_file_name(self.image.name, "painting")
-        write_whole(new / painting, self.image.data)
+    def _write_contents(self, new: Path) -> None:
+        """Writes a run but for its config."""
+        write_whole(new / self._painting, self.image.data)
         save_thumbnail(new, self.image)
         for name in BESIDE_CHECKPOINTS:
             if (self.workshop.folder / name).is_file():
                 shutil.copy(self.workshop.folder / name, new / name)
         self.effects.save(new)
+        own = {f"_model.residual.{name}": value for name, value in self.field.state_dict().items()}
         step = self.iterations - 1
         path = checkpoint_path(new / self.config.relative_model_dir, step)
-        write_checkpoint(path, step, self._state(), self.optimizers, self._notes())
-        return painting
+        write_checkpoint(path, step, {**self.pipeline.state_dict(), **own}, self.optimizers, self.notes())
 
-    def _write_config(self, new: Path, folder: Path, painting: Path) -> None:
+    def _write_config(self, new: Path, folder: Path) -> None:
         """Writes the config of a run that will lie in `folder`."""
         config = copy.deepcopy(self.config)
         config.timestamp, config.max_num_iterations = folder.name, self.iterations
         config.load_dir = config.load_step = config.load_checkpoint = None
-        config.pipeline.style_image, config.pipeline.decided = folder / painting, self.effects
+        config.pipeline.style_image, config.pipeline.decided = folder / self._painting, self.effects
         write_whole(new / "config.yml", yaml.dump(config))
 
-    def _state(self) -> Dict[str, Tensor]:
-        """The pipeline's state, with the new field in place of the run's own."""
-        state = {name: value for name, value in self.pipeline.state_dict().items() if not name.startswith(RESIDUAL)}
-        return {**state, **{RESIDUAL + name: value for name, value in self.field.state_dict().items()}}
-
-    def _notes(self) -> CheckpointNotes:
-        settings = self.config.pipeline
-        return CheckpointNotes(
-            effects=self.effects.records(),
-            backbone=asdict(self.workshop.backbone().description),
-            coarse_run=str(settings.coarse_run),
-            coarse_field=asdict(settings.model.coarse_field),
-            fine_encoding=settings.model.fine_encoding,
-        )
+    def notes(self) -> CheckpointNotes:
+        """What its checkpoint says beside the state."""
+        return style_notes(self.pipeline, self.effects, asdict(self.workshop.backbone().description))

@@ -2,12 +2,11 @@
 
 import copy
 import shlex
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Callable, Dict, List, Literal, Optional, Type
+from typing import Dict, List, Literal, Optional
 
 import torch
-import tyro
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -15,16 +14,16 @@ from torch import Tensor
 
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import decide
-from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.engine.hints import scene_arguments
-from sparsestyle_ns.engine.trainer import SparseStyleTrainer, SparseStyleTrainerConfig
-from sparsestyle_ns.engine.training_step import warm_start
+from sparsestyle_ns.engine.trainer import SparseStyleTrainer
+from sparsestyle_ns.engine.training import warm_start
 from sparsestyle_ns.field_components.tiny_cuda_grid import has_tiny_cuda_nn
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig, StyleInputs
-from sparsestyle_ns.runs.checkpoints import CheckpointNotes, load_checkpoint
+from sparsestyle_ns.runs.checkpoints import CheckpointNotes
 from sparsestyle_ns.runs.coarse_run import CoarseRun, check_scene, find_coarse_run, read_coarse_run
+from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD
 from sparsestyle_ns.runs.scene_record import record_scene
 from sparsestyle_ns.runs.thumbnail import save_thumbnail
 from sparsestyle_ns.utils.distributed import from_first_process
@@ -32,36 +31,40 @@ from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.progress import bar
 
 PHOTO_SETTINGS = (
-    "data",
-    "dataparser",
-    "num_views",
-    "view_ids",
-    "max_image_side",
-    "seed",
-    "camera_res_scale_factor",
+    *("data", "dataparser", "num_views", "view_ids"),
+    *("max_image_side", "seed", "camera_res_scale_factor"),
 )
 """Of the data manager: what both stages of a scene have in common."""
+RUN_SETTINGS = ("data", "output_dir", "experiment_name", "project_name", "machine", "logging")
+"""Of the trainer: the same."""
 
 
-@dataclass
-class HierStyleTrainerConfig(SparseStyleTrainerConfig):
-    """Settings of a stylised run."""
+def style_notes(pipeline: HierStylePipeline, effects: Decisions, backbone: Dict[str, str]) -> CheckpointNotes:
+    """The notes of a stylised checkpoint.
 
-    _target: Type = field(default_factory=lambda: HierStyleTrainer)
-    coarse_method: tyro.conf.Suppress[Optional[Callable[[], SparseStyleTrainerConfig]]] = None
-    """Gives the settings of the stage 1 that is trained first where there is no coarse run."""
+    Args:
+        pipeline: of the scene.
+        effects: that the style is made with.
+        backbone: name, source and sha256 of the feature network.
+    """
+    return {
+        "effects": effects.records(),
+        "backbone": backbone,
+        "coarse_run": str(pipeline.config.coarse_run),
+        "coarse_field": asdict(pipeline.config.model.coarse_field),
+        "fine_encoding": pipeline.model.config.fine_encoding,
+    }
 
 
 class HierStyleTrainer(SparseStyleTrainer):
     """Trains a stylised field."""
 
     stage = "Stage 2"
-    config: HierStyleTrainerConfig
     pipeline: HierStylePipeline
-    _first_notes: Optional[CheckpointNotes] = None
-    """The notes of the checkpoint that is gone on with."""
     _coarse_state: Optional[Dict[str, Tensor]] = None
-    _style: Optional[StyleInputs] = None
+    _style: StyleInputs
+    _backbone: Dict[str, str]
+    """The feature network's description; in a run that is gone on with, how it was found when that began."""
 
     @exit_on_input_error
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
@@ -70,61 +73,54 @@ class HierStyleTrainer(SparseStyleTrainer):
         for name in ("style_image", "vgg_weights"):  # the run may be measured from another folder
             path: Optional[Path] = getattr(pipeline, name)
             setattr(pipeline, name, None if path is None else path.expanduser().resolve())
-        checkpoint = self.resumed_checkpoint()
-        if checkpoint is not None:
-            self._adopt_notes(pipeline, CheckpointNotes.of(load_checkpoint(checkpoint)))
+        before: CheckpointNotes = self.resumed or {}
+        if "coarse_field" in before:  # not in a coarse run's; loading that says what is wrong
+            _adopt_notes(pipeline, before)
         self._style = pipeline.load_style()
-        pipeline.backbone = self._style.backbone.description.name
-        if checkpoint is None:
+        self._backbone = asdict(self._style.backbone.description)
+        pipeline.backbone = self._backbone["name"]
+        if before.get("backbone", {}).get("sha256") == self._backbone["sha256"]:
+            self._backbone = before["backbone"]
+        if self.resumed is None:
             self._check_encoding(pipeline)
-            manager: FewShotDataManager = pipeline.datamanager.setup(device="cpu", test_mode="inference")
-            decided = decide(manager.scene, pipeline.effects)
-            run = self.coarse_run(manager, decided)
-            pipeline.coarse_run = run.folder.resolve()
-            pipeline.model.coarse_field = copy.deepcopy(run.config.pipeline.model.coarse_field)
-            pipeline.decided = self._decide(manager.scene, run, decided)
-            self._coarse_state = run.model_state()
+            self._begin(pipeline)
         self.config = replace(self.config, pipeline=pipeline)
         super().setup(test_mode)
         self._keep_thumbnail()
         if self._start_step == 0:
-            self._warm_start()
-
-    def _warm_start(self) -> None:
-        steps = self.pipeline.config.warm_start_steps
-        rate = self.optimizers.optimizers["fields"].param_groups[0]["lr"]
-        with bar("Warm start", steps) as warming:
-            for _ in warm_start(self.pipeline, self.pipeline.task, rate):
-                warming.advance()
+            rate = self.optimizers.optimizers["fields"].param_groups[0]["lr"]
+            with bar("Warm start", pipeline.warm_start_steps) as warming:
+                for _ in warm_start(self.pipeline, self.pipeline.task, rate):
+                    warming.advance()
 
     def _check_encoding(self, pipeline: HierStylePipelineConfig) -> None:
-        model = pipeline.model
-        if model.fine_encoding != "tiny-cuda-nn":
-            return
-        if not has_tiny_cuda_nn(torch.device(self.device), model.features_per_level):
+        rows = pipeline.model.features_per_level
+        if pipeline.model.fine_encoding == "tiny-cuda-nn" and not has_tiny_cuda_nn(torch.device(self.device), rows):
             raise InputError(
                 "--pipeline.model.fine-encoding is tiny-cuda-nn, which isn't installed here, finds no GPU, or has no "
-                f"rows of {model.features_per_level} features (but of 1, 2, 4 and 8); leave the setting out: the hash "
-                "grid has kernels of its own."
+                f"rows of {rows} features (but of 1, 2, 4 and 8); leave the setting out: the hash grid has kernels of "
+                "its own."
             )
+
+    def _begin(self, pipeline: HierStylePipelineConfig) -> None:
+        """Finds the coarse run of a new run, and decides what is simulated: as there, the rest by its field."""
+        manager: FewShotDataManager = pipeline.datamanager.setup(device="cpu", test_mode="inference")
+        scene = manager.scene
+        decided = decide(scene, pipeline.effects)
+        run = self._coarse_run(manager, decided)
+        pipeline.coarse_run = run.folder.resolve()
+        pipeline.model.coarse_field = copy.deepcopy(run.config.pipeline.model.coarse_field)
+        scene.coarse_density, scene.style_image = run.density(decided), self._style.painting.pixels
+        pipeline.decided = decide(scene, pipeline.effects, decided)
+        self._coarse_state = run.model_state()
 
     @check_main_thread
     def _keep_thumbnail(self) -> None:
         save_thumbnail(self.base_dir, self._style.painting)
 
     def notes(self) -> CheckpointNotes:
-        """Which feature network stylised the scene, where its weights came from, and which coarse run it builds on."""
-        pipeline = self.config.pipeline
-        backbone, first = asdict(self.pipeline.targets.backbone.description), self._first_notes
-        if first is not None and first.backbone is not None and first.backbone["sha256"] == backbone["sha256"]:
-            backbone = first.backbone  # how it was found when the run began
-        return replace(
-            super().notes(),
-            backbone=backbone,
-            coarse_run=str(pipeline.coarse_run),
-            coarse_field=asdict(pipeline.model.coarse_field),
-            fine_encoding=self.pipeline.model.config.fine_encoding,
-        )
+        """See `style_notes`."""
+        return style_notes(self.pipeline, self.pipeline.effects, self._backbone)
 
     def _load_checkpoint(self) -> None:
         super()._load_checkpoint()
@@ -133,22 +129,7 @@ class HierStyleTrainer(SparseStyleTrainer):
             self.pipeline.model.adopt_coarse(self._coarse_state)
             self._coarse_state = None
 
-    def _adopt_notes(self, pipeline: HierStylePipelineConfig, notes: CheckpointNotes) -> None:
-        """Takes from the run that is resumed what was found out when it began: the coarse field, and what auto was.
-
-        Its config.yml may be this command's own by now, where training goes on in the same folder.
-        """
-        if notes.coarse_field is None:  # a coarse run's; loading it says what is wrong
-            return
-        self._first_notes = notes
-        pipeline.model.coarse_field = CoarseFieldConfig(**notes.coarse_field)
-        pipeline.coarse_run = Path(notes.coarse_run)
-        if pipeline.model.fine_encoding == "auto":
-            pipeline.model.fine_encoding = notes.fine_encoding
-        if pipeline.backbone == "auto" and pipeline.vgg_weights is None:
-            pipeline.backbone = notes.backbone["name"]
-
-    def coarse_run(self, manager: FewShotDataManager, decided: Decisions) -> CoarseRun:
+    def _coarse_run(self, manager: FewShotDataManager, decided: Decisions) -> CoarseRun:
         """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now.
 
         Args:
@@ -165,27 +146,23 @@ class HierStyleTrainer(SparseStyleTrainer):
             check_scene(run, scene)
             CONSOLE.print(f"Stylising the coarse run {run.in_words()}.", soft_wrap=True)
             return run
-        draft = self.config.method_name.endswith("-draft")
-        methods = ("coarse-fewshot", "coarse-fewshot-draft") if draft else ("coarse-fewshot",)
+        own = self.config.method_name.replace(STYLE_METHOD, COARSE_METHOD)
+        methods = {own, COARSE_METHOD} if own.endswith("-draft") else {own}
         found = from_first_process(find_coarse_run(self.config.output_dir, methods, scene))
         if found is not None:
             CONSOLE.print(f"Stylising the newest coarse run of this scene, {found.folder}.")
             return found
         CONSOLE.print("There is no finished coarse run of this scene and these views; training one first.")
-        return self._train_coarse(decided)
+        return self._train_coarse(own, decided)
 
-    def _decide(self, scene: Scene, run: CoarseRun, decided: Decisions) -> Decisions:
-        """What is simulated: as in the coarse run, and the rest by its field and the painting."""
-        scene.coarse_density = run.density(decided)
-        scene.style_image = self._style.painting.pixels
-        return decide(scene, self.config.pipeline.effects, decided)
+    def _train_coarse(self, method: str, decided: Decisions) -> CoarseRun:
+        from nerfstudio.configs.method_configs import all_methods  # nerfstudio's own circle: it imports all methods
 
-    def _train_coarse(self, decided: Decisions) -> CoarseRun:
-        config, ours = self.config.coarse_method(), self.config
+        config, ours = copy.deepcopy(all_methods[method]), self.config
         for name in PHOTO_SETTINGS:
             setattr(config.pipeline.datamanager, name, copy.deepcopy(getattr(ours.pipeline.datamanager, name)))
         config.pipeline.effects, config.pipeline.decided = ours.pipeline.effects, decided
-        for name in ("data", "output_dir", "experiment_name", "project_name", "machine", "logging"):
+        for name in RUN_SETTINGS:
             setattr(config, name, getattr(ours, name))
         config.vis = "tensorboard"
         config.viewer.quit_on_train_completion = True
@@ -197,7 +174,6 @@ class HierStyleTrainer(SparseStyleTrainer):
         trainer.setup()
         trainer.train_to_end()
         if trainer._interrupted:
-            method = config.method_name
             resume = ["ns-train", method, "--load-dir", str(trainer.checkpoint_dir), *scene_arguments(config)]
             raise InputError(
                 "The coarse run was interrupted, so there is nothing to stylise yet; finish it with "
@@ -211,3 +187,16 @@ class HierStyleTrainer(SparseStyleTrainer):
     def next_command(self) -> List[str]:
         """See `SparseStyleTrainer.next_command`."""
         return ["sparsestyle", "gallery", str(self.base_dir)]
+
+
+def _adopt_notes(pipeline: HierStylePipelineConfig, notes: CheckpointNotes) -> None:
+    """Takes from the run that is resumed what was found out when it began: the coarse field, and what auto was.
+
+    Its config.yml may be this command's own by now, where training goes on in the same folder.
+    """
+    pipeline.model.coarse_field = CoarseFieldConfig(**notes["coarse_field"])
+    pipeline.coarse_run = Path(notes["coarse_run"])
+    if pipeline.model.fine_encoding == "auto":
+        pipeline.model.fine_encoding = notes["fine_encoding"]
+    if pipeline.backbone == "auto" and pipeline.vgg_weights is None:
+        pipeline.backbone = notes["backbone"]["name"]

@@ -1,10 +1,11 @@
 """nerfstudio's trainer, made to keep what it has: whole checkpoints, also on Ctrl-C, and resuming where it stopped."""
 
+import functools
 import signal
 import warnings
 from abc import ABC, abstractmethod
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import Any, ClassVar, Dict, List, Literal, Optional, Tuple, Type
@@ -19,11 +20,12 @@ from nerfstudio.utils.decorators import check_main_thread, check_viewer_enabled
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from sparsestyle_ns.effects.base import Decisions, EffectSettings
-from sparsestyle_ns.engine.hints import finish, resume_command
+from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.engine.hints import finish, ns_train_style, resume_command
 from sparsestyle_ns.engine.previews import preview_steps, render_preview, save_preview
-from sparsestyle_ns.engine.training_step import check_skipped, training_step
+from sparsestyle_ns.engine.training import check_skipped, training_step
 from sparsestyle_ns.pipelines.base import CheckedPipeline
+from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.runs.checkpoints import (
     CheckpointNotes,
     checkpoint_path,
@@ -35,12 +37,15 @@ from sparsestyle_ns.runs.scene_record import record_scene
 from sparsestyle_ns.utils.distributed import any_process, prepare_launch, share_state
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.files import write_whole
-from sparsestyle_ns.utils.progress import bar, say
+from sparsestyle_ns.utils.progress import bar
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 
-LEARNING_RATE_FLAG = "--optimizers.fields.optimizer.lr"
 STEPS_PER_LOOK = 10
 """Iterations between looks at the count of skipped steps, each of which waits for a GPU."""
+
+
+warnings.filterwarnings("ignore", message="Using a non-tuple sequence", module="nerfstudio")
+warnings.filterwarnings("ignore", message="Sparse invariant checks are implicitly disabled")
 
 
 def this_machine() -> MachineConfig:
@@ -86,10 +91,6 @@ class SparseStyleTrainerConfig(TrainerConfig):
             ) from error
 
 
-warnings.filterwarnings("ignore", message="Using a non-tuple sequence", module="nerfstudio")
-warnings.filterwarnings("ignore", message="Sparse invariant checks are implicitly disabled")
-
-
 class SparseStyleTrainer(Trainer, ABC):
     """The trainer of both methods."""
 
@@ -107,9 +108,10 @@ class SparseStyleTrainer(Trainer, ABC):
         self._preview_steps = preview_steps(self.config.previews, self.config.max_num_iterations)
         self._reported = 0
         self._kept_step: Optional[int] = None
-        checkpoint = self.resumed_checkpoint()
-        if checkpoint is not None:
-            self.config.pipeline.decided = read_decisions(checkpoint, self.config.pipeline.effects)
+        if self.resumed is not None and "effects" in self.resumed:
+            decided = Decisions.from_records(self.resumed["effects"])
+            decided.check_choices(self.config.pipeline.effects, f"the checkpoint {self._resumed_checkpoint()}")
+            self.config.pipeline.decided = decided
         super().setup(test_mode)
         self._save_record()
 
@@ -129,12 +131,17 @@ class SparseStyleTrainer(Trainer, ABC):
         self._saved_decisions = self.pipeline.effects
         self.config.save_config()
 
-    def resumed_checkpoint(self) -> Optional[Path]:
-        """The checkpoint that training goes on from; None for a new run.
+    @functools.cached_property
+    def resumed(self) -> Optional[Dict[str, Any]]:
+        """What is in the checkpoint that training goes on from, until it is loaded; None for a new run.
 
         Raises:
-            InputError: there is none where the command line says.
+            InputError: there is none where the command line says, or it can't be read.
         """
+        checkpoint = self._resumed_checkpoint()
+        return None if checkpoint is None else load_checkpoint(checkpoint)
+
+    def _resumed_checkpoint(self) -> Optional[Path]:
         for source in (self.config.load_dir, self.config.load_checkpoint):
             if source is not None and not source.exists():
                 raise InputError(
@@ -150,21 +157,18 @@ class SparseStyleTrainer(Trainer, ABC):
         return checkpoint
 
     def _load_checkpoint(self) -> None:
-        checkpoint = self.resumed_checkpoint()
-        if checkpoint is not None:
-            self._resume(load_checkpoint(checkpoint))
-            CONSOLE.print(f"Going on from {checkpoint}.", soft_wrap=True)
-        share_state(self.pipeline.model)
-
-    def _resume(self, state: Dict[str, Any]) -> None:
         """Takes over all of a checkpoint, as nerfstudio does."""
-        self.pipeline.load_pipeline(state["pipeline"], state["step"])
-        self.optimizers.load_optimizers(state["optimizers"])
-        if self.config.load_scheduler:
-            self.optimizers.load_schedulers(state["schedulers"])
-        self.grad_scaler.load_state_dict(state["scalers"])
-        self._start_step = state["step"] + 1
-        self._kept_step = state["step"]
+        state = self.resumed
+        if state is not None:
+            self.pipeline.load_pipeline(state["pipeline"], state["step"])
+            self.optimizers.load_optimizers(state["optimizers"])
+            if self.config.load_scheduler:
+                self.optimizers.load_schedulers(state["schedulers"])
+            self.grad_scaler.load_state_dict(state["scalers"])
+            self._start_step, self._kept_step = state["step"] + 1, state["step"]
+            CONSOLE.print(f"Going on from {self._resumed_checkpoint()}.", soft_wrap=True)
+        self.resumed = None
+        share_state(self.pipeline.model)
 
     @exit_on_input_error
     def train(self) -> None:
@@ -259,7 +263,7 @@ class SparseStyleTrainer(Trainer, ABC):
             self._look_at_skipped(step)
 
     def _look_at_skipped(self, step: int) -> int:
-        """Reports steps that were skipped since the last look; returns how many were, in a row, up to now."""
+        """Reports steps that were skipped since the last look; returns how many were in a row up to now."""
         total = self.optimizers.skipped().total
         if total > self._reported:
             CONSOLE.print(
@@ -271,8 +275,8 @@ class SparseStyleTrainer(Trainer, ABC):
         kept = "No checkpoint was saved before."
         if self._kept_step is not None:
             kept = f"The checkpoint of iteration {self._kept_step + 1} is from before and stays."
-        advice = f"training stopped after iteration {step + 1}. Try a lower learning rate, {LEARNING_RATE_FLAG}. {kept}"
-        return check_skipped(self.optimizers, self.config.max_skipped_steps, advice)
+        advice = f"try a lower learning rate, --optimizers.fields.optimizer.lr. {kept}"
+        return check_skipped(self.optimizers, self.config.max_skipped_steps, step, advice)
 
     def eval_iteration(self, step: int) -> None:
         """What nerfstudio evaluates after an iteration, and the preview after some; then it is over.
@@ -292,10 +296,7 @@ class SparseStyleTrainer(Trainer, ABC):
     def _write_preview(self, iterations: int) -> None:
         picture = render_preview(self.pipeline, self.config.preview_side)
         writer.put_image(name="Preview", image=picture, step=iterations)
-        try:
-            save_preview(picture, self.base_dir, iterations)
-        except OSError as error:
-            say(f"The preview after {iterations} iterations can't be saved ({error.strerror}); training goes on.")
+        save_preview(picture, self.base_dir, iterations)
 
     def finish(self) -> None:
         """Prints the command's last line."""
@@ -311,7 +312,7 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def notes(self) -> CheckpointNotes:
         """What a checkpoint says beside the state."""
-        return CheckpointNotes(effects=self.pipeline.effects.records())
+        return {"effects": self.pipeline.effects.records()}
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
@@ -346,18 +347,20 @@ class SparseStyleTrainer(Trainer, ABC):
             self.save_decisions()
 
 
-def read_decisions(checkpoint: Path, settings: EffectSettings) -> Optional[Decisions]:
-    """Which effects a checkpoint was made with; None where it doesn't say.
+class CoarseFewShotTrainer(SparseStyleTrainer):
+    """Trains a coarse field."""
 
-    Raises:
-        InputError: the settings ask for others.
-    """
-    records = load_checkpoint(checkpoint).get("effects")
-    if records is None:
-        return None
-    decisions = Decisions.from_records(records)
-    decisions.check_choices(settings, f"the checkpoint {checkpoint}")
-    return decisions
+    stage = "Stage 1"
+    pipeline: CoarseFewShotPipeline
+
+    def notes(self) -> CheckpointNotes:
+        """What `SparseStyleTrainer.notes` has and, where a feature network took part, which."""
+        unseen = self.pipeline.unseen
+        return {**super().notes(), **({} if unseen is None else {"backbone": asdict(unseen.backbone.description)})}
+
+    def next_command(self) -> List[str]:
+        """See `SparseStyleTrainer.next_command`."""
+        return ns_train_style(self.base_dir, self.config)
 
 
 class TrainingInterruptedError(Exception):

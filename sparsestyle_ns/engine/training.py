@@ -1,24 +1,103 @@
-"""A method's training without nerfstudio's trainer: iterations that can be timed one by one."""
+"""One step of training, the same for the trainer, warm start, restyling and studies, and training of such steps."""
 
 import copy
+import functools
+from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Callable, Dict, Optional
+from typing import Callable, Dict, Iterator, Mapping, Optional, Tuple
 
 import torch
+from jaxtyping import Float
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
+from torch.amp import GradScaler
 
-from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
-from sparsestyle_ns.engine.training_step import training_step, warm_start
-from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
+from sparsestyle_ns.pipelines.base import CheckedPipeline
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleTask
+from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 
 
+@dataclass
+class FusedAdamConfig(AdamOptimizerConfig):
+    """Adam in one pass over memory."""
+
+    betas: Tuple[float, float] = (0.9, 0.999)
+    """Decay of the running means of the gradient and its square."""
+    fused: bool = True
+    """Whether to use the fused implementation; the values are the same up to rounding."""
+
+
+def training_step(
+    optimizers: Optimizers,
+    compute_losses: Callable[[int], Mapping[str, Float[Tensor, ""]]],
+    step: int,
+    scaler: Optional[GradScaler] = None,
+    accumulate: Optional[Mapping[str, int]] = None,
+) -> Float[Tensor, ""]:
+    """Minimises a sum of losses by one step of the optimisers and their schedules.
+
+    Args:
+        optimizers: of all parameters that learn.
+        compute_losses: gives the losses of an iteration by name, weighted.
+        step: the iteration, from 0.
+        scaler: of gradients, for half precision; None: gradients as they are.
+        accumulate: of a group of parameters, the iterations whose gradients are added up for a step; 1 if not named.
+
+    Returns:
+        The sum, without its gradient.
+    """
+    scaler, every = scaler or GradScaler(enabled=False), accumulate or {}
+    groups = list(optimizers.parameters)
+    optimizers.zero_grad_some([name for name in groups if step % every.get(name, 1) == 0])
+    loss = functools.reduce(torch.add, compute_losses(step).values())
+    scaler.scale(loss).backward()
+    due = [name for name in groups if (step + 1) % every.get(name, 1) == 0]
+    optimizers.optimizer_scaler_step_some(scaler, due)
+    scale = scaler.get_scale()
+    scaler.update()
+    if scale <= scaler.get_scale():  # a smaller one says that the step was skipped
+        for scheduler in optimizers.schedulers.values():
+            scheduler.step()
+    return loss.detach()
+
+
+def warm_start(pipeline: HierStylePipeline, task: StyleTask, learning_rate: float) -> Iterator[int]:
+    """Fits a new style's colours to whole photos (`HierStylePipeline.warm_start_loss`); an iterator of its steps.
+
+    Args:
+        pipeline: of the scene.
+        task: the field and its views.
+        learning_rate: Adam's; that of the iterations that follow.
+    """
+    adam = {"fields": {"optimizer": FusedAdamConfig(lr=learning_rate), "scheduler": None}}
+    optimizers = FiniteOptimizers(adam, {"fields": list(task.style.parameters())})
+    for step in range(pipeline.config.warm_start_steps):
+        training_step(optimizers, lambda step: pipeline.warm_start_loss(task, step), step)
+        yield step
+    optimizers.zero_grad_all()
+
+
+def check_skipped(optimizers: FiniteOptimizers, most: int, step: int, advice: str) -> int:
+    """How many steps were skipped in a row up to now, because their gradients weren't finite; waits for a GPU.
+
+    Raises:
+        InputError: there are `most` or more, up to iteration `step`; the sentence ends with `advice`.
+    """
+    in_a_row = optimizers.skipped().in_a_row
+    if in_a_row >= most:
+        raise InputError(
+            f"Training stopped after iteration {step + 1}, because the gradients of the last {in_a_row} weren't "
+            f"finite; {advice}"
+        )
+    return in_a_row
+
+
 class Training:
-    """A method's pipeline and optimisers. `step` is an iteration of nerfstudio's trainer without its logging.
+    """A method's training without nerfstudio's trainer: iterations that can be timed one by one.
 
     Args:
         config: of any nerfstudio method.
@@ -41,15 +120,12 @@ class Training:
             self.pipeline.model.adopt_coarse(coarse_state)
         if prepare is not None:
             prepare(self.pipeline)
-        kind = FiniteOptimizers if isinstance(config, SparseStyleTrainerConfig) else Optimizers
+        kind = FiniteOptimizers if isinstance(self.pipeline, CheckedPipeline) else Optimizers
         self.optimizers = kind(copy.deepcopy(config.optimizers), self.pipeline.get_param_groups())
-        attributes = TrainingCallbackAttributes(
-            optimizers=self.optimizers,
-            grad_scaler=None,
-            pipeline=self.pipeline,
-            trainer=SimpleNamespace(config=config),
+        trainer = SimpleNamespace(config=config)
+        self.callbacks = self.pipeline.get_training_callbacks(
+            TrainingCallbackAttributes(self.optimizers, None, self.pipeline, trainer)
         )
-        self.callbacks = self.pipeline.get_training_callbacks(attributes)
         self.num_steps = 0
         if isinstance(self.pipeline, HierStylePipeline):
             rate = self.optimizers.optimizers["fields"].param_groups[0]["lr"]
@@ -57,7 +133,7 @@ class Training:
                 pass
 
     def step(self) -> Tensor:
-        """One iteration; returns its loss."""
+        """One iteration of nerfstudio's trainer without its logging; returns its loss."""
         self.pipeline.train()
         for callback in self.callbacks:
             callback.run_callback_at_location(self.num_steps, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)

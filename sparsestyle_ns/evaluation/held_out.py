@@ -3,7 +3,7 @@
 import json
 import statistics
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Dict, List, Optional, Sequence, Union
 
@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datasets.base_dataset import InputDataset
-from nerfstudio.models.base_model import Model
 from torch import Tensor
 from torchvision.utils import save_image
 
@@ -39,19 +38,16 @@ MIN_ACCUMULATION = 0.5
 
 @dataclass
 class HeldOutReport:
-    """What was measured of a run.
-
-    Attributes:
-        means: means over the held-out views, and for a stylised run those over pairs of the measuring path.
-        views: the held-out views' own values.
-        rays: each view's pixels.
-        seconds: how long each view took to render.
-    """
+    """What was measured of a run."""
 
     means: Dict[str, float]
+    """Over the held-out views, and for a stylised run those over pairs of the measuring path."""
     views: List[Dict[str, float]]
-    rays: List[int]
-    seconds: List[float]
+    """The held-out views' own values."""
+    rays: List[int] = field(default_factory=list)
+    """Each view's pixels; not in a file."""
+    seconds: List[float] = field(default_factory=list)
+    """How long each view took to render; not in a file."""
 
     def deviations(self) -> Dict[str, float]:
         """As `…_std`, the standard deviations between views; nothing of what fewer than two views have."""
@@ -61,10 +57,8 @@ class HeldOutReport:
     def speed(self) -> Dict[str, float]:
         """`num_rays_per_sec` and `fps`, means over the views."""
         rates = [rays / seconds for rays, seconds in zip(self.rays, self.seconds, strict=True)]
-        return {
-            "num_rays_per_sec": statistics.fmean(rates),
-            "fps": statistics.fmean(1.0 / seconds for seconds in self.seconds),
-        }
+        fps = statistics.fmean(1.0 / seconds for seconds in self.seconds)
+        return {"num_rays_per_sec": statistics.fmean(rates), "fps": fps}
 
     def save(self, path: Path, experiment: str, method: str, step: int) -> None:
         """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means.
@@ -72,42 +66,23 @@ class HeldOutReport:
         Raises:
             OSError: it can't be written.
         """
-        content = {
-            "experiment_name": experiment,
-            "method_name": method,
-            "step": step,
-            "results": self.means,
-            "views": self.views,
-        }
-        write_whole(path, json.dumps(content, indent=2) + "\n")
+        run = {"experiment_name": experiment, "method_name": method, "step": step}
+        write_whole(path, json.dumps({**run, "results": self.means, "views": self.views}, indent=2) + "\n")
+
+
+def saved_report(folder: Path, step: int) -> Optional[HeldOutReport]:
+    """The report in a run's folder, where there is one of the checkpoint of iteration `step`."""
+    try:
+        content = json.loads((folder / REPORT_FILE).read_text())
+        return HeldOutReport(content["results"], list(content["views"])) if content["step"] == step else None
+    except (OSError, ValueError, KeyError, TypeError):  # there is none, or another file has its name
+        return None
 
 
 def by_figure(views: Sequence[Dict[str, float]]) -> Dict[str, List[float]]:
     """Each figure's values, of the views that have it."""
     names = dict.fromkeys(name for view in views for name in view)
     return {name: [view[name] for view in views if name in view] for name in names}
-
-
-@dataclass
-class SavedReport:
-    """What a report on the disk says.
-
-    Attributes:
-        means: see `HeldOutReport`.
-        num_views: held-out views that they are means of.
-    """
-
-    means: Dict[str, float]
-    num_views: int
-
-
-def saved_report(folder: Path, step: int) -> Optional[SavedReport]:
-    """The report in a run's folder, where there is one of the checkpoint of iteration `step`."""
-    try:
-        content = json.loads((folder / REPORT_FILE).read_text())
-        return SavedReport(content["results"], len(content["views"])) if content["step"] == step else None
-    except (OSError, ValueError, KeyError, TypeError):  # there is none, or another file has its name
-        return None
 
 
 @torch.no_grad()
@@ -135,7 +110,7 @@ def evaluate_held_out(
         baked: whether a stylised model's baked renders are held against the exact ones as well (`baked_psnr`, in dB).
         picture_folder: where to save the views as pictures, beside their photos; None for nowhere.
     """
-    measure = _CoarseMeasure(model) if isinstance(model, CoarseFewShotModel) else _StyleMeasure(model, targets, baked)
+    style = None if isinstance(model, CoarseFewShotModel) else _StyleMeasure(model, targets, baked)
     values, rays, seconds = [], [], []
     for index in track(range(len(views)), "Held-out views"):
         camera = views.cameras[index : index + 1].to(model.device)
@@ -144,27 +119,24 @@ def evaluate_held_out(
         outputs = exact_outputs(model, camera)
         seconds.append(time.perf_counter() - start)
         rays.append(photo.shape[0] * photo.shape[1])
-        values.append(measure.view(outputs, photo, camera))
+        if style is not None:
+            values.append(style.view(outputs, photo, camera))
+        else:
+            effective = mean_effective_samples(model, camera)
+            extra = {} if effective is None else {"effective_samples": effective}
+            values.append({**image_metrics(outputs["rgb"], photo), **extra})
         if picture_folder is not None:
-            _save_pictures(model, outputs, photo, picture_folder, index)
-    means = {key: sum(found) / len(found) for key, found in by_figure(values).items()} | measure.of_all_views()
-    if isinstance(model, HierStyleModel) and len(training_cameras) > 1:
-        means.update(render_path(model, measuring_path(training_cameras)).figures())
+            picture_folder.mkdir(parents=True, exist_ok=True)
+            _, pictures = model.get_image_metrics_and_images(outputs, {"image": photo})
+            for name, picture in pictures.items():
+                save_image(picture.permute(2, 0, 1).cpu(), picture_folder / f"eval_{name}_{index:04d}.png")
+    means = {key: statistics.fmean(found) for key, found in by_figure(values).items()}
+    if style is not None:
+        if style.art_fid is not None:
+            means.update(style.art_fid.figures())
+        if len(training_cameras) > 1:
+            means.update(render_path(model, measuring_path(training_cameras)).figures())
     return HeldOutReport(means, values, rays, seconds)
-
-
-class _CoarseMeasure:
-    """What is measured of a coarse model's views."""
-
-    def __init__(self, model: CoarseFewShotModel) -> None:
-        self.model = model
-
-    def view(self, outputs: Dict[str, Tensor], photo: Tensor, camera: Cameras) -> Dict[str, float]:
-        effective = mean_effective_samples(self.model, camera)
-        return image_metrics(outputs["rgb"], photo) | ({} if effective is None else {"effective_samples": effective})
-
-    def of_all_views(self) -> Dict[str, float]:
-        return {}
 
 
 class _StyleMeasure:
@@ -188,16 +160,6 @@ class _StyleMeasure:
             with model.rendering("baked"):
                 values["baked_psnr"] = psnr(model.get_outputs_for_camera(camera)["rgb"], stylised)
         return values
-
-    def of_all_views(self) -> Dict[str, float]:
-        return {} if self.art_fid is None else self.art_fid.figures()
-
-
-def _save_pictures(model: Model, outputs: Dict[str, Tensor], photo: Tensor, folder: Path, index: int) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    _, pictures = model.get_image_metrics_and_images(outputs, {"image": photo})
-    for name, picture in pictures.items():
-        save_image(picture.permute(2, 0, 1).cpu(), folder / f"eval_{name}_{index:04d}.png")
 
 
 def exact_outputs(model: Union[CoarseFewShotModel, HierStyleModel], camera: Cameras) -> Dict[str, Tensor]:

@@ -84,34 +84,15 @@ def locate_corners(positions: Float[Tensor, "points 3"], resolutions: Tuple[int,
     return Corners((hash_corners(corners, table_size) + level_start).int(), near.prod(dim=-1))
 
 
-class _GatherSum(torch.autograd.Function):
-    """Weighted sums of table rows, without the eight summands of each written down in the forward pass."""
-
-    @staticmethod
-    def forward(ctx, table: Tensor, corners: Corners) -> Tensor:
-        ctx.save_for_backward(*corners)  # an attribute would outlive a checkpointed chunk's forward pass
-        ctx.rows = len(table)
-        points, levels, count = corners.rows.shape
-        bags = (points * levels, count)
-        weights = corners.weights.to(table.dtype).reshape(bags)
-        sums = F.embedding_bag(corners.rows.reshape(bags), table, per_sample_weights=weights, mode="sum")
-        return sums.view(points, levels * table.shape[-1])
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> Tuple[Tensor, None]:
-        rows, weights = ctx.saved_tensors
-        bags = grad.reshape(rows.shape[0] * rows.shape[1], 1, grad.shape[-1] // rows.shape[1])
-        parts = weights.to(grad.dtype).reshape(-1, 8, 1) * bags
-        table_grad = grad.new_zeros(ctx.rows, parts.shape[-1])
-        return table_grad.index_add_(0, rows.flatten().long(), parts.flatten(0, 1)), None
-
-
 def interpolate(table: Float[Tensor, "rows features"], corners: Corners) -> Float[Tensor, "points encoded"]:
     """Weighted sums of table rows: for each point and level, the eight corners' features; levels one after another.
 
     Differentiable in the table; corners are taken as given.
     """
-    return _GatherSum.apply(table, corners)
+    points, levels, _ = corners.rows.shape
+    rows, weights = corners.rows.flatten(0, 1), corners.weights.flatten(0, 1).to(table.dtype)
+    sums = F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+    return sums.view(points, levels * table.shape[-1])
 
 
 def fused_kernels(device: torch.device) -> Optional[ModuleType]:

@@ -63,16 +63,10 @@ def _kernels(features: int) -> Tuple[Callable[..., None], Callable[..., None]]:
         for point in range(start, end):
             rows, weights = _cell(positions[point], resolution, mask)
             for feature in range(features):
-                encoded[point, level, feature] = (
-                    weights[0] * table[level, rows[0], feature]
-                    + weights[1] * table[level, rows[1], feature]
-                    + weights[2] * table[level, rows[2], feature]
-                    + weights[3] * table[level, rows[3], feature]
-                    + weights[4] * table[level, rows[4], feature]
-                    + weights[5] * table[level, rows[5], feature]
-                    + weights[6] * table[level, rows[6], feature]
-                    + weights[7] * table[level, rows[7], feature]
-                )
+                total = weights[0] * table[level, rows[0], feature]
+                for corner in range(1, 8):
+                    total += weights[corner] * table[level, rows[corner], feature]
+                encoded[point, level, feature] = total
 
     @kernel
     def scatter(positions, table_grad, resolution, level, grad):

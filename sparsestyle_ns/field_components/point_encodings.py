@@ -5,7 +5,6 @@ Both have the hash grid's two steps, `locate` and `interpolate`, though locating
 
 from typing import Protocol
 
-import torch
 from jaxtyping import Float
 from nerfstudio.field_components.encodings import FieldComponent
 from torch import Tensor
@@ -39,24 +38,21 @@ class FrequencyEncoding(FieldComponent):
         self.num_levels = num_levels
 
     def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
-        """See `PointEncoding.locate`."""
+        """The points as they are."""
         return GridLocation(positions, None)
 
     def interpolate(self, location: GridLocation) -> Float[Tensor, "points encoded"]:
-        """See `PointEncoding.interpolate`."""
+        """γ at the points."""
         return positional_encoding(2.0 * location.positions - 1.0, self.num_levels)
 
 
-class NoEncoding(FieldComponent):
+class NoEncoding(FrequencyEncoding):
     """No numbers at all: the residual field is left with e_c."""
 
     def __init__(self) -> None:
-        super().__init__(in_dim=3, out_dim=0)
-
-    def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
-        """See `PointEncoding.locate`."""
-        return GridLocation(positions, None)
+        super().__init__(num_levels=0)
+        self.out_dim = 0
 
     def interpolate(self, location: GridLocation) -> Float[Tensor, "points 0"]:
-        """See `PointEncoding.interpolate`."""
-        return torch.empty(len(location.positions), 0, device=location.positions.device)
+        """Nothing."""
+        return location.positions[:, :0]

@@ -151,7 +151,7 @@ class CoarseFieldConfig:
     direction_levels: int = 4
     """Octaves of the view direction's encoding, where colour depends on it (`--pipeline.effects.view-color`)."""
     density_activation: DensityActivation = "exp"
-    """What keeps the density positive. exp finds surfaces sooner than softplus (README, Where the paper is silent)."""
+    """What keeps the density positive. exp finds surfaces sooner than softplus (docs/method.md)."""
     density_bias: float = 1.0
     """Added to the density's logit: a field that starts as dense fog is less drawn to the far end of its rays."""
 

@@ -14,7 +14,7 @@ from sparsestyle_ns.data.photos import PhotoDataset, at_size
 from sparsestyle_ns.data.view_selection import evenly_spaced
 from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.engine.loading import load_run
-from sparsestyle_ns.evaluation.held_out import SavedReport, by_figure, exact_outputs, saved_report
+from sparsestyle_ns.evaluation.held_out import HeldOutReport, by_figure, exact_outputs, saved_report
 from sparsestyle_ns.evaluation.tables import Table, report_tables, table_of
 from sparsestyle_ns.gallery.film import as_pixels, make_film, read_film
 from sparsestyle_ns.gallery.gallery_options import GalleryOptions
@@ -87,20 +87,20 @@ def collect_run(
         style=_style_picture(painting),
         style_note=f"The style image, {painting}, is no longer there.",
         film=film,
-        tables=[_views_table(measured)] if report is None else report_tables(report.means, report.num_views),
+        tables=[_views_table(measured)] if report is None else report_tables(report.means, len(report.views)),
         settings=_settings(config, dataset, step),
         effects=pipeline.effects.rows(),
     )
 
 
-def _evaluate(folder: Path, config: TrainerConfig, pipeline: HierStylePipeline, step: int) -> SavedReport:
+def _evaluate(folder: Path, config: TrainerConfig, pipeline: HierStylePipeline, step: int) -> HeldOutReport:
     """Measures a run on all held-out views, and saves the report in its folder, if that can be."""
     report = pipeline.held_out_report()
     try:
         report.save(folder / REPORT_FILE, config.experiment_name, config.method_name, step)
     except OSError as error:
         say(f"{REPORT_FILE} can't be saved in {folder} ({error.strerror}); its figures are on the page.")
-    return SavedReport(report.means, len(report.views))
+    return report
 
 
 def _render_views(pipeline: HierStylePipeline, num_views: int) -> Tuple[List[View], List[Dict[str, float]]]:

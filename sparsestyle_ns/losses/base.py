@@ -10,12 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class PaintingFeatures:
-    """A painting as losses see it.
-
-    Attributes:
-        image: RGB in [0, 1].
-        rows: its feature vectors, one a row.
-    """
+    """A painting as losses see it: RGB in [0, 1], and its feature vectors, one a row."""
 
     image: Float[Tensor, "3 H W"]
     rows: Float[Tensor, "rows C"]
@@ -23,30 +18,20 @@ class PaintingFeatures:
 
 @dataclass(frozen=True)
 class StylizedView:
-    """A rendered view, and what it must stay like.
-
-    Attributes:
-        image: the stylised picture, RGB.
-        features: its feature vectors where the scene covers it, one a row; differentiable.
-        content: those of the content picture, row for row.
-    """
+    """A rendered view, and what it must stay like."""
 
     image: Float[Tensor, "H W 3"]
     features: Float[Tensor, "rows C"]
+    """Of the picture, where the scene covers it; differentiable."""
     content: Float[Tensor, "rows C"]
+    """Those of the content picture, row for row."""
 
 
 class StylizationLoss(ABC):
-    """A loss of views, made once for a painting.
-
-    Args:
-        painting: what the views are to become like.
-
-    Attributes:
-        weight: in the sum, unless the run's settings say otherwise; 0 is off, and costs nothing.
-    """
+    """A loss of views, made once for the painting that they are to become like."""
 
     weight: ClassVar[float] = 0.0
+    """In the sum, unless the run's settings say otherwise; 0 is off, and costs nothing."""
 
     def __init__(self, painting: PaintingFeatures) -> None:  # noqa: B027 - a loss may need nothing of the painting
         pass

@@ -34,9 +34,6 @@ def content_loss(features: Float[Tensor, "*shape"], target: Float[Tensor, "*shap
         target: what the content picture gives, of the same shape. It gets no gradient. Where it is all zero there
             is no size to divide by, and the squared error is returned as it is.
 
-    Returns:
-        A scalar, 0 or more, without a unit.
-
     Raises:
         ValueError: the two shapes differ, which broadcasting would otherwise hide.
 

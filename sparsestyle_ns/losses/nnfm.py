@@ -1,8 +1,4 @@
-"""The style loss: nearest neighbour feature matching (NNFM; ARF, Sec. 4).
-
-`nearest_neighbors` compares everything with everything; a `StyleIndex`, made once for a style, gives the same
-neighbours faster.
-"""
+"""The style loss: nearest neighbour feature matching (NNFM; ARF, Sec. 4)."""
 
 from typing import Optional, Union
 
@@ -39,15 +35,9 @@ def nearest_neighbors(
 ) -> Int[Tensor, " N"]:
     """For each feature vector the style's most similar one, by cosine.
 
-    The search is exact and compares everything with everything, but holds at most `chunk_size`² similarities at a
-    time, so its memory does not grow with the number of pixels. No gradient passes. Similarities have at least
-    float32's digits, also of half-precision features and under autocast.
-
-    Args:
-        features: one vector a row.
-        style_features: the style's vectors, one a row, M ≥ 1; or their index, which gives the same answer faster.
-        chunk_size: rows of either compared at once, 1 or more. It changes memory and time, not the answer. An index
-            has limits of its own.
+    The search is exact and compares everything with everything, `chunk_size` rows of either at a time, so that its
+    memory does not grow with the number of pixels; a `StyleIndex`, made once for a style, gives the same answer faster.
+    No gradient passes. Similarities have at least float32's digits, also of half-precision features and under autocast.
 
     Returns:
         Rows of `style_features`, 0 … M − 1; of several equally similar ones the first.
@@ -110,11 +100,7 @@ def nnfm_loss(
 def _nearest_of_chunk(
     directions: Float[Tensor, "n C"], style_directions: Float[Tensor, "M C"], chunk_size: int
 ) -> Int[Tensor, " n"]:
-    best = directions.new_full((len(directions),), -torch.inf)
-    nearest = torch.zeros(len(directions), dtype=torch.long, device=directions.device)
-    for start in range(0, len(style_directions), chunk_size):
-        similarities = directions @ style_directions[start : start + chunk_size].T
-        values, rows = similarities.max(dim=1)
-        nearest = torch.where(values > best, rows + start, nearest)
-        best = torch.maximum(values, best)
-    return nearest
+    maxima = [(directions @ part.T).max(dim=1) for part in style_directions.split(chunk_size)]
+    values, rows = (torch.stack(each) for each in zip(*maxima, strict=True))
+    best = values.argmax(dim=0)
+    return rows.gather(0, best[None])[0] + chunk_size * best

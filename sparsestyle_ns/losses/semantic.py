@@ -18,10 +18,8 @@ def semantic_loss(embeddings: Float[Tensor, "B C"], targets: Float[Tensor, "B C"
 
     DietNeRF writes it as ½ |φ − φ*|² of embeddings of length 1, which is the same.
 
-    Args:
-        embeddings: of rendered views. One no longer than `style_index.SHORTEST` has no direction: it counts as cosine
-            0 and gets a gradient of zero.
-        targets: of photos, each of its render's. They get no gradient.
+    An embedding no longer than `style_index.SHORTEST` has no direction: it counts as cosine 0 and gets a gradient of
+    zero. Targets, each of its render's photo, get none.
 
     Returns:
         A scalar in [0, 2]; in [0, 1] for embeddings that are never negative.

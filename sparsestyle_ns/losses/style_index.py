@@ -11,19 +11,14 @@ from sparsestyle_ns.core.precision import at_least_float32, without_autocast
 
 SHORTEST = 1e-12
 """Vectors no longer than this have no direction."""
-
 COARSE, FINE = 23, 127
 """Principal directions in which similarities are bounded, first of all pairs and then of those that are left."""
-
 BLOCK_SIZES = {"cpu": 128, "cuda": 1024}
 """Most style vectors in a block of a `StyleIndex`; a GPU wants fewer and larger products."""
-
 BOUNDED_AT_ONCE = {"cpu": 1024, "cuda": 4096}
 """Vectors of either kind whose similarities are bounded at once; on a CPU the bounds should stay in its cache."""
-
 TABLE_SIZE = 1 << 23
 """Bounds kept at once, one for each feature vector and block; 32 MiB in float32."""
-
 BASIS_SAMPLE = 4096
 """Style vectors from which the principal directions are found."""
 
@@ -89,12 +84,14 @@ class StyleIndex:
 
         bounds = self._bounds(coarse)
         favorites = bounds.argmax(dim=0)
-        matches.compare(*_sorted_pairs(favorites))
+        by_block = favorites.argsort()
+        matches.compare(favorites[by_block], by_block)
         bounds.scatter_(0, favorites[None], -torch.inf)
         blocks, rows = (bounds >= matches.best).nonzero(as_tuple=True)
 
         finer_bounds, _ = _block_maxima(fine, self.fine, blocks, rows)
-        is_favorite = finer_bounds == _maxima_by_row(finer_bounds, rows, len(directions))[rows]
+        best_bounds = finer_bounds.new_full((len(directions),), -torch.inf)
+        is_favorite = finer_bounds == best_bounds.scatter_reduce_(0, rows, finer_bounds, "amax")[rows]
         matches.compare(blocks[is_favorite], rows[is_favorite])
         is_left = ~is_favorite & (finer_bounds >= matches.best[rows])
         matches.compare(blocks[is_left], rows[is_left])
@@ -202,12 +199,6 @@ def _similar_blocks(points: Float[Tensor, "M k"], block_size: int) -> Int[Tensor
     return order.view(2**depth, leaf_size).sort(dim=1).values
 
 
-def _sorted_pairs(blocks: Int[Tensor, " n"]) -> Tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
-    """Each row with its block, sorted by block."""
-    rows = blocks.argsort()
-    return blocks[rows], rows
-
-
 def _block_maxima(
     vectors: Float[Tensor, "n K"],
     style_blocks: Float[Tensor, "blocks size K"],
@@ -221,7 +212,3 @@ def _block_maxima(
     ]
     values, places = zip(*maxima, strict=True)
     return torch.cat(values), torch.cat(places)
-
-
-def _maxima_by_row(values: Float[Tensor, " P"], rows: Int[Tensor, " P"], num_rows: int) -> Float[Tensor, " num_rows"]:
-    return values.new_full((num_rows,), -torch.inf).scatter_reduce_(0, rows, values, "amax")

@@ -28,12 +28,7 @@ def default_weights() -> Dict[str, float]:
 
 @dataclass(frozen=True)
 class Losses:
-    """What an iteration minimises.
-
-    Attributes:
-        values: of the losses, by name, not weighted.
-        weights: of each in this iteration.
-    """
+    """What an iteration minimises: its losses by name, not weighted, and their weights in this iteration."""
 
     values: Dict[str, Float[Tensor, ""]]
     weights: Dict[str, float]
@@ -49,17 +44,10 @@ class Losses:
 
 
 def fit_side(image: Float[Tensor, "B C H W"], longer_side: int, smallest_side: int = 1) -> Float[Tensor, "B C h w"]:
-    """An image enlarged or reduced (bilinear, antialiased) so that its longer side has this many pixels.
-
-    Args:
-        image: any.
-        longer_side: in pixels.
-        smallest_side: the least that either side gets.
-    """
-    height, width = image.shape[-2:]
-    scale = longer_side / max(height, width)
-    size = (max(smallest_side, round(height * scale)), max(smallest_side, round(width * scale)))
-    if size == (height, width):
+    """An image resized (bilinear, antialiased) to a longer side of so many pixels, and no side below the smallest."""
+    scale = longer_side / max(image.shape[-2:])
+    size = tuple(max(smallest_side, round(length * scale)) for length in image.shape[-2:])
+    if size == image.shape[-2:]:
         return image
     return F.interpolate(image, size=size, mode="bilinear", antialias=True, align_corners=False)
 
@@ -94,7 +82,6 @@ class StyleTargets:
     Kept out of the model's modules: a stylised checkpoint holds neither the network nor the painting.
 
     Args:
-        backbone: gives the features.
         style_image: in [0, 1], on the device of the network.
         feature_side: longer side, in pixels, at which the network sees rendered and content pictures.
         style_side: longer side at which it sees the style image; it sets how large strokes are.
@@ -111,15 +98,12 @@ class StyleTargets:
         style_features: Optional[int] = None,
         losses: Collection[str] = ("content", "style"),
     ) -> None:
-        self.backbone = backbone
-        self.feature_side = feature_side
-        self.style_side = style_side
-        self.style_image = style_image
+        self.backbone, self.feature_side = backbone, feature_side
+        self.style_image, self.style_side = style_image, style_side
         with torch.no_grad():
             rows = self.style_rows()
-            painting = PaintingFeatures(
-                style_image, rows if style_features is None else sample_rows(rows, style_features)
-            )
+            rows = rows if style_features is None else sample_rows(rows, style_features)
+            painting = PaintingFeatures(style_image, rows)
             self.by_name = {name: LOSSES[name](painting) for name in losses}
 
     def features(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 C h w"]:

@@ -13,15 +13,16 @@ so do covariances of so few squares: they rank rows that are measured alike, and
 import functools
 import math
 from pathlib import Path
-from typing import Any, Dict, List, Optional
+from typing import Dict, List, Optional
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sparsestyle_ns.metrics.image import ALEXNET_FILE, hub_folder, lpips_metric
+from sparsestyle_ns.metrics.image import ALEXNET_FILE, lpips_metric
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.weight_files import check_tensor, hub_file, read_state
 
 ART_INCEPTION_FILE = "art_inception.pth"
 HEADS = ("fc1.", "fc2.", "AuxLogits1.", "AuxLogits2.")
@@ -72,6 +73,7 @@ def squares(picture: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "squares 3 side 
     return torch.cat([picture[..., top : top + SQUARE, left : left + SQUARE] for top in tops for left in lefts])
 
 
+@functools.lru_cache(maxsize=1)
 def load_art_inception(path: Path) -> nn.Module:
     """The Inception-v3 of a file as ArtFID's authors publish it; pictures in [0, 1] in, 2048 features a picture out.
 
@@ -87,63 +89,38 @@ def load_art_inception(path: Path) -> nn.Module:
     with torch.device("meta"):  # the weights come from the file, and torch's random state stays untouched
         network = inception_v3(weights=None, aux_logits=False, init_weights=False, transform_input=False)
     network.fc = nn.Identity()
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a file that is no checkpoint can fail in many ways
-        raise _not_art_inception(path, "it can't be read") from error
-    if not isinstance(state, dict):
-        raise _not_art_inception(path, "it holds no state dict")
     expected = network.state_dict()
-    for name in state:
-        if name not in expected and not str(name).startswith(HEADS):
-            raise _not_art_inception(path, f"{name} belongs to another network")
-    for name, value in expected.items():
-        _check_tensor(path, name, state.get(name), value)
-    network.load_state_dict({name: state[name].to(value.dtype) for name, value in expected.items()}, assign=True)
+    try:
+        state = read_state(path)
+        for name in state:
+            if name not in expected and not str(name).startswith(HEADS):
+                raise ValueError(f"{name} belongs to another network")
+        found = {name: check_tensor(state, name, value.shape).to(value.dtype) for name, value in expected.items()}
+    except ValueError as error:
+        raise InputError(
+            f"{path} is not the Inception-v3 of ArtFID's authors ({error}): fetch their {ART_INCEPTION_FILE} again, or "
+            "take the file away to measure without ArtFID."
+        ) from error
+    network.load_state_dict(found, assign=True)
     return network.eval().requires_grad_(False)
-
-
-def _check_tensor(path: Path, name: str, found: Any, expected: Tensor) -> None:
-    if not isinstance(found, Tensor):
-        raise _not_art_inception(path, f"{name} is missing")
-    if found.shape != expected.shape:
-        raise _not_art_inception(path, f"{name} has the shape {tuple(found.shape)} instead of {tuple(expected.shape)}")
-    if not found.isfinite().all():
-        raise _not_art_inception(path, f"{name} has values that are not finite")
-
-
-def _not_art_inception(path: Path, reason: str) -> InputError:
-    return InputError(
-        f"{path} is not the Inception-v3 of ArtFID's authors ({reason}): fetch their {ART_INCEPTION_FILE} again, or "
-        "take the file away to measure without ArtFID."
-    )
-
-
-_loaded = functools.cache(load_art_inception)
 
 
 def missing_weights() -> List[str]:
     """The files that ArtFID needs and the torch hub cache doesn't have."""
-    return [name for name in (ART_INCEPTION_FILE, ALEXNET_FILE) if not (hub_folder() / name).is_file()]
+    return [name for name in (ART_INCEPTION_FILE, ALEXNET_FILE) if not hub_file(name).is_file()]
 
 
 def why_left_out(figures: Dict[str, float]) -> str:
     """A sentence on ArtFID where `figures` don't have it; nothing where they do."""
     if "art_fid" in figures:
         return ""
-    missing = missing_weights()
-    if missing:
-        return f"ArtFID is left out: it needs {' and '.join(missing)} in {hub_folder()}."
-    return "ArtFID is left out: there was no painting to measure against."
+    folder, missing = hub_file(ART_INCEPTION_FILE).parent, " and ".join(missing_weights())
+    reason = f"it needs {missing} in {folder}" if missing else "there was no painting to measure against"
+    return f"ArtFID is left out: {reason}."
 
 
 class ArtFID:
-    """ArtFID of pictures that are added one by one.
-
-    Args:
-        network: see `load_art_inception`.
-        painting: the style, in [0, 1].
-    """
+    """ArtFID of pictures that are added one by one, by the network of `load_art_inception`; the painting in [0, 1]."""
 
     def __init__(self, network: nn.Module, painting: Float[Tensor, "3 H W"]) -> None:
         self.network = network
@@ -158,7 +135,7 @@ class ArtFID:
         Raises:
             InputError: the file of the Inception-v3 is another network's.
         """
-        return None if missing_weights() else cls(_loaded(hub_folder() / ART_INCEPTION_FILE), painting)
+        return None if missing_weights() else cls(load_art_inception(hub_file(ART_INCEPTION_FILE)), painting)
 
     @torch.no_grad()
     def _features(self, picture: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "squares 2048"]:

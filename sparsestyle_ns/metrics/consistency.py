@@ -1,13 +1,13 @@
 """How alike two views of a stylised scene are where both show the same points (short- and long-range consistency)."""
 
-from typing import Callable, Dict, List, Optional, Sequence
+from typing import Dict, Optional, Sequence
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sparsestyle_ns.metrics.image import lpips_metric, st_lpips_metric
+from sparsestyle_ns.metrics.image import Metric, perceptual_metrics
 from sparsestyle_ns.metrics.warping import Correspondence, Surface, correspond, sample_picture
 from sparsestyle_ns.utils.progress import track
 
@@ -54,18 +54,15 @@ def masked_ssim(
 
 
 def masked_distance(
-    metric: Callable[[Tensor, Tensor], Tensor],
+    metric: Metric,
     first: Float[Tensor, "H W 3"],
     second: Float[Tensor, "H W 3"],
     visible: Bool[Tensor, "H W"],
 ) -> float:
-    """A perceptual distance of visible pixels.
+    """A perceptual distance of visible pixels, by a metric that is a mean over pixels, 0 where pictures are equal.
 
     What isn't visible is black in both pictures, where they are alike, and the distance, a mean over the whole picture,
     is divided by the visible share.
-
-    Args:
-        metric: a distance of two batches [1, 3, H, W] in [0, 1], 0 where they are equal; a mean over pixels.
     """
     mask = visible[..., None]
     pictures = (torch.where(mask, picture, 0.0).permute(2, 0, 1)[None].cpu() for picture in (first, second))
@@ -85,21 +82,20 @@ def pair_consistency(
         return {}
     first, second = first.clamp(0.0, 1.0), second.clamp(0.0, 1.0)
     warped = sample_picture(second, correspondence.pixels)
-    values = {
+    return {
         "rmse": float(masked_rmse(first, warped, visible)),
         "ssim": float(masked_ssim(first, warped, visible)),
+        **{
+            name: masked_distance(metric, first, warped, visible)
+            for name, metric in perceptual_metrics(first.shape[:2]).items()
+        },
     }
-    for name, metric in (("lpips", lpips_metric(first.shape[:2])), ("st_lpips", st_lpips_metric(first.shape[:2]))):
-        if metric is not None:
-            values[name] = masked_distance(metric, first, warped, visible)
-    return values
 
 
 class PathGeometry:
     """Which pixels of a path's frames show the same points; worked out once for all pictures that are measured by it.
 
-    Args:
-        surfaces: what each frame shows of the unstylised scene.
+    `surfaces` are what each frame shows of the unstylised scene.
     """
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
@@ -121,13 +117,8 @@ class PathGeometry:
         means = {}
         for name, gap in RANGES.items():
             pairs = track(self.pairs[name], f"Consistency, {name} range")
-            values = [
-                pair_consistency(frames[t], frames[t + gap], correspondence) for t, correspondence in enumerate(pairs)
-            ]
-            means.update({f"{name}_{key}": value for key, value in _means(values).items()})
+            values = [pair_consistency(frames[t], frames[t + gap], pair) for t, pair in enumerate(pairs)]
+            kept = [value for value in values if value]
+            for key in kept[0] if kept else ():
+                means[f"{name}_{key}"] = sum(value[key] for value in kept) / len(kept)
         return means
-
-
-def _means(values: List[Dict[str, float]]) -> Dict[str, float]:
-    kept = [value for value in values if value]
-    return {key: sum(value[key] for value in kept) / len(kept) for key in kept[0]} if kept else {}

@@ -5,7 +5,6 @@ heads come with the package stlpips-pytorch, of which only the weight file is re
 """
 
 import functools
-import importlib.util
 from pathlib import Path
 from typing import Callable, Dict, List, Optional, Tuple
 
@@ -14,6 +13,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestyle_ns.utils.weight_files import hub_file, read_state, shift_tolerant_file
+
+Metric = Callable[[Float[Tensor, "B 3 H W"], Float[Tensor, "B 3 H W"]], Float[Tensor, ""]]
+"""Distance of pictures in [0, 1]."""
 ALEXNET_FILE = "alexnet-owt-7be5be79.pth"
 SHIFT_TOLERANT_LAYERS = (
     ("net.slice1.0", "net.slice1.1"),
@@ -31,44 +34,41 @@ MIN_SHIFT_TOLERANT_SIDE = 24
 
 def psnr(image: Float[Tensor, "H W 3"], reference: Float[Tensor, "H W 3"]) -> float:
     """Peak signal-to-noise ratio in dB, of images in [0, 1]."""
-    return float(-10.0 * torch.log10((image - reference).square().mean()))
+    return float(psnr_of_error((image - reference).square().mean()))
 
 
-def hub_folder() -> Path:
-    """Where torch keeps weights that it has downloaded once."""
-    return Path(torch.hub.get_dir()) / "checkpoints"
+def psnr_of_error(error: Float[Tensor, ""]) -> Float[Tensor, ""]:
+    """Peak signal-to-noise ratio in dB, −10 log10 of the mean squared error of colours in [0, 1]."""
+    return -10.0 * torch.log10(error)
+
+
+def has_lpips() -> bool:
+    """Whether the weights that LPIPS needs are in the torch hub cache."""
+    return hub_file(ALEXNET_FILE).is_file()
 
 
 @functools.cache
-def _load_lpips(weights: Path) -> Callable[[Tensor, Tensor], Tensor]:
+def _load_lpips(weights: Path) -> Metric:
     """The metric with these weights, which torchmetrics finds by itself."""
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
 
 
-def has_lpips() -> bool:
-    """Whether the weights that LPIPS needs are in the torch hub cache."""
-    return (hub_folder() / ALEXNET_FILE).is_file()
-
-
-def lpips_metric(size: Tuple[int, ...]) -> Optional[Callable[[Tensor, Tensor], Tensor]]:
+def lpips_metric(size: Tuple[int, ...]) -> Optional[Metric]:
     """LPIPS with AlexNet for pictures of a height and width, on the CPU.
 
     None where these are too small, or the network's weights are not in the torch hub cache. torchmetrics would download
     them; measuring a picture must not depend on a network.
     """
-    return _load_lpips(hub_folder() / ALEXNET_FILE) if has_lpips() and min(size) >= MIN_LPIPS_SIDE else None
+    return _load_lpips(hub_file(ALEXNET_FILE)) if has_lpips() and min(size) >= MIN_LPIPS_SIDE else None
 
 
 class ShiftTolerantLPIPS:
     """ST-LPIPS with AlexNet: the distance of two pictures in the features of five layers.
 
     Each layer's feature vectors are scaled to length 1; their squared differences, weighted by channel, are averaged
-    over the picture and summed over the layers (Zhang et al. 2018, Eq. 1).
-
-    Args:
-        state: the weight file's content.
+    over the picture and summed over the layers (Zhang et al. 2018, Eq. 1). `state` is the weight file's content.
     """
 
     def __init__(self, state: Dict[str, Tensor]) -> None:
@@ -90,9 +90,8 @@ class ShiftTolerantLPIPS:
         return maps
 
     def _blur(self, maps: Tensor, name: str) -> Tensor:
-        return F.conv2d(
-            F.pad(maps, (2, 2, 2, 2), mode="reflect"), self.state[f"{name}.filt"], stride=2, groups=maps.shape[1]
-        )
+        padded = F.pad(maps, (2, 2, 2, 2), mode="reflect")
+        return F.conv2d(padded, self.state[f"{name}.filt"], stride=2, groups=maps.shape[1])
 
     @torch.no_grad()
     def __call__(self, first: Float[Tensor, "B 3 H W"], second: Float[Tensor, "B 3 H W"]) -> Float[Tensor, ""]:
@@ -104,17 +103,20 @@ class ShiftTolerantLPIPS:
 
 
 @functools.cache
-def _load_st_lpips() -> Optional[ShiftTolerantLPIPS]:
-    package = importlib.util.find_spec("stlpips_pytorch")
-    if package is None or not package.submodule_search_locations:
-        return None
-    path = Path(package.submodule_search_locations[0]) / "weights" / "vST0.0" / "alex_shift_tolerant.pth"
-    return ShiftTolerantLPIPS(torch.load(path, map_location="cpu", weights_only=True)) if path.is_file() else None
+def _load_st_lpips() -> Optional[Metric]:
+    path = shift_tolerant_file("alex_shift_tolerant.pth")
+    return path and ShiftTolerantLPIPS(read_state(path))
 
 
-def st_lpips_metric(size: Tuple[int, ...]) -> Optional[ShiftTolerantLPIPS]:
+def st_lpips_metric(size: Tuple[int, ...]) -> Optional[Metric]:
     """ST-LPIPS for pictures of a height and width, on the CPU; None where its weights are gone or these too small."""
     return _load_st_lpips() if min(size) >= MIN_SHIFT_TOLERANT_SIDE else None
+
+
+def perceptual_metrics(size: Tuple[int, ...]) -> Dict[str, Metric]:
+    """`lpips` and `st_lpips`, as far as pictures of this height and width can be measured by them."""
+    metrics = {"lpips": lpips_metric(size), "st_lpips": st_lpips_metric(size)}
+    return {name: metric for name, metric in metrics.items() if metric is not None}
 
 
 def image_metrics(image: Float[Tensor, "H W 3"], photo: Float[Tensor, "H W 3"]) -> Dict[str, float]:
@@ -123,11 +125,8 @@ def image_metrics(image: Float[Tensor, "H W 3"], photo: Float[Tensor, "H W 3"]) 
 
     image, photo = image.detach().clamp(0.0, 1.0).cpu(), photo.cpu()
     batch, reference = (picture.permute(2, 0, 1)[None] for picture in (image, photo))
-    metrics = {
+    return {
         "psnr": psnr(image, photo),
         "ssim": float(structural_similarity_index_measure(batch, reference, data_range=1.0)),
+        **{name: float(metric(batch, reference)) for name, metric in perceptual_metrics(photo.shape[:2]).items()},
     }
-    for name, metric in (("lpips", lpips_metric(photo.shape[:2])), ("st_lpips", st_lpips_metric(photo.shape[:2]))):
-        if metric is not None:
-            metrics[name] = float(metric(batch, reference))
-    return metrics

@@ -20,15 +20,10 @@ MIN_COVERAGE = 0.5
 
 @dataclass
 class Pinhole:
-    """A camera without distortion.
-
-    Attributes:
-        camera_to_world: right, up, back and position, one a column.
-        focal: in pixels, horizontal and vertical.
-        center: of the picture, in pixels.
-    """
+    """A camera without distortion; lengths in pixels, horizontal and vertical."""
 
     camera_to_world: Float[Tensor, "3 4"]
+    """Right, up, back and position, one a column."""
     focal: Tuple[float, float]
     center: Tuple[float, float]
 
@@ -45,13 +40,7 @@ class Pinhole:
 
 @dataclass
 class Surface:
-    """What a camera sees of the unstylised scene.
-
-    Attributes:
-        camera: the camera.
-        points: world points that the pixels show.
-        covered: which pixels show a surface at all.
-    """
+    """What a camera sees of the unstylised scene: the world points that its pixels show, and which show any."""
 
     camera: Pinhole
     points: Float[Tensor, "H W 3"]
@@ -59,12 +48,7 @@ class Surface:
 
 
 class Correspondence(NamedTuple):
-    """Where the pixels of one view are found in another.
-
-    Attributes:
-        pixels: coordinates in the other view.
-        visible: whether the other view shows the same point there.
-    """
+    """Where the pixels of one view are found in another, and whether that one shows the same point there."""
 
     pixels: Float[Tensor, "H W 2"]
     visible: Bool[Tensor, "H W"]

@@ -22,7 +22,7 @@ from sparsestyle_ns.field_components.thinned_mlp import Thinning
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.losses.geometry import matched_depth_loss, near_density
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
-from sparsestyle_ns.metrics.image import image_metrics
+from sparsestyle_ns.metrics.image import image_metrics, psnr_of_error
 from sparsestyle_ns.models.scene_model import SceneModel
 from sparsestyle_ns.rendering.render import DenseRender, render_coarse, seen_behind, surface_distance
 from sparsestyle_ns.utils.distributed import gather_rays, num_processes, shard_rays
@@ -45,10 +45,10 @@ class CoarseFewShotModelConfig(ModelConfig):
     num_bins: int = 64
     """Bins of the histogram that samples follow where empty space is skipped."""
     thinning: float = 2.0
-    """Samples whose gradient is smaller than this many times the batch's mean take part in the backward pass with a
-    probability in proportion only, and count for more where they do; 0: all samples take part."""
+    """Spares the backward pass samples with small gradients: of those below this many times the batch's mean, some are
+    drawn, in proportion to their size, and count for more. 0 keeps all samples."""
     even_share: float = 0.4
-    """Share of those samples, in (0, 1], that is spread evenly."""
+    """Share of the samples, in (0, 1], that is spread evenly along a ray where empty space is skipped."""
     grid_resolution: int = 64
     """Cells along a side of the grid that remembers density."""
     distortion_weight: float = 0.015
@@ -189,7 +189,7 @@ class CoarseFewShotModel(SceneModel):
         """PSNR of the batch, in dB, and effective samples a ray."""
         photo = batch["image"].to(self.device)
         error = reconstruction_loss(outputs["rgb"][: len(photo)].detach(), photo)
-        metrics = {"psnr": -10.0 * torch.log10(error)}
+        metrics = {"psnr": psnr_of_error(error)}
         if "weights" in outputs:
             metrics["effective_samples"] = effective_samples(outputs["weights"].detach()).mean()
         return metrics

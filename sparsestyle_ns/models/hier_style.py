@@ -64,14 +64,15 @@ class HierStyleModelConfig(FineFieldConfig, ModelConfig):
     """Number format of matrix products: auto is bfloat16 where the device multiplies it, else float32; tf32 is for
     GPUs."""
     render_mode: RenderMode = "exact"
-    """How pictures are made outside of training. baked keeps the fields in a voxel grid, filled where rays come by: a
-    scene's first picture takes as long as an exact one, those from near by a small part of that, also on a CPU. The
-    viewer has a control for it; for ns-render, write `render_mode: baked` into the run's config.yml."""
+    """How pictures are made outside of training. exact evaluates the fields at every sample. baked reads them from a
+    voxel grid that is filled where rays pass: the first picture of a place takes as long as an exact one, later ones a
+    small part of that, on a CPU too. The viewer has a control for it; for ns-render, set `render_mode: baked` in the
+    run's config.yml."""
     strength: float = 1.0
-    """From 0, the coarse field, to 1, the stylised one, in pictures made outside of training. The viewer has controls
-    for this and the next; for ns-render, write them into the run's config.yml, as render_mode."""
+    """How much of the style pictures outside of training show: 0 is the coarse field, 1 the stylised one. The viewer
+    has controls for this and the next; for ns-render, set them in the run's config.yml."""
     geometry_strength: float = 1.0
-    """Share of the residual density, 0 to 1, that these pictures show."""
+    """Share of the residual density in these pictures, from 0 to 1."""
     bake_resolution: int = 256
     """Cells along the cube's side in baked rendering. Each brick of 8³ that rays have been to takes 4 KiB: at most
     147 MB with 256, 482 MB with 384."""

@@ -33,7 +33,7 @@ class CheckedPipelineConfig(VanillaPipelineConfig):
     datamanager: DataManagerConfig = field(default_factory=FewShotDataManagerConfig)
     """The photos."""
     effects: EffectSettings = field(default_factory=EffectSettings)
-    """Which effects are simulated; auto measures whether the scene calls for them."""
+    """Which effects are simulated; auto measures whether the scene needs them."""
     decided: tyro.conf.Suppress[Optional[Decisions]] = None
     """What was decided, with its reasons; a loaded run has it and measures nothing."""
     vgg_weights: Annotated[Optional[Path], tyro.conf.arg(aliases=("--vgg-weights",))] = None
@@ -73,9 +73,11 @@ class CheckedPipeline(VanillaPipeline):
         local_rank: int = 0,
         grad_scaler: Optional[GradScaler] = None,
     ) -> None:
-        Pipeline.__init__(self)  # VanillaPipeline's would build the model without what is decided
+        Pipeline.__init__(self)  # VanillaPipeline's would build the model before anything is decided
         self.config, self.test_mode = config, test_mode
-        self.world_size = 1  # however many processes there are, the model is not to be wrapped (see `distributed`)
+        self.world_size = (
+            1  # several processes share the rays themselves (`utils.distributed`), the model isn't wrapped
+        )
         self.datamanager = config.datamanager.setup(device=device, test_mode=test_mode, local_rank=local_rank)
         self.datamanager.to(device)
         if config.decided is None:

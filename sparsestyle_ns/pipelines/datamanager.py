@@ -9,6 +9,7 @@ from typing import Annotated, Any, Dict, Literal, Optional, Tuple, Type, Union
 import torch
 import tyro
 from jaxtyping import Float, Int
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import (
     DataManager,
@@ -101,11 +102,10 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         world_size: int = 1,
         local_rank: int = 0,
     ) -> None:
-        # Not VanillaDataManager's, which reads the scene unchecked.
+        # In place of VanillaDataManager's, which reads the scene unchecked.
         self.config, self.device, self.test_mode = config, device, test_mode
-        self.world_size, self.local_rank, self.sampler = world_size, local_rank, None
+        self.world_size, self.local_rank = world_size, local_rank
         self._check_settings()
-        self.dataparser_config = config.dataparser
         if config.data is None:
             config.data = config.dataparser.data
         config.dataparser.data = config.data = Path(config.data)
@@ -120,8 +120,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         self.exclude_batch_keys_from_device = self.train_dataset.exclude_batch_keys_from_device
         if config.masks_on_gpu and "mask" in self.exclude_batch_keys_from_device:
             self.exclude_batch_keys_from_device.remove("mask")
-        sizes = [self.train_dataset.cameras.width.unique(), self.train_dataset.cameras.height.unique()]
-        if any(len(each) > 1 for each in sizes):
+        if not has_one_size(self.train_dataset.cameras):
             config.collate_fn = variable_res_collate  # what nerfstudio does for photos of several sizes
         DataManager.__init__(self)
 
@@ -140,7 +139,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
             info.view_ids, config.num_views, config.view_ids, info.default_num_views, info.standard_views
         )
         selected = select_outputs(outputs, chosen)
-        if len(outputs.cameras.width.unique()) == len(outputs.cameras.height.unique()) == 1:
+        if has_one_size(outputs.cameras):
             # Blender's cameras have the size of the first photo, also where that isn't trained on.
             check_one_size([outputs.image_filenames[0], *selected.image_filenames])
         if self.test_mode == "val":
@@ -173,14 +172,9 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         return dataset
 
     @property
-    def view_ids(self) -> Tuple[int, ...]:
-        """The ids of the views that are trained on."""
-        return scene_info(self.train_dataparser_outputs).view_ids
-
-    @property
     def scene(self) -> Scene:
         """The training views, for measuring."""
-        return Scene.of(self.train_dataparser_outputs)
+        return Scene(self.train_dataparser_outputs)
 
     def set_effects(self, effects: Decisions) -> None:
         """Takes over what was decided, before photos are loaded: whether lenses bend rays, and whether depth is known.
@@ -249,6 +243,11 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
     def get_train_rays_per_batch(self) -> int:
         """Rays of a batch that this process renders."""
         return self.config.train_num_rays_per_batch // num_processes()
+
+
+def has_one_size(cameras: Cameras) -> bool:
+    """Whether all of some cameras have photos of one size."""
+    return len(cameras.width.unique()) == len(cameras.height.unique()) == 1
 
 
 def gather_pixels(dataset: InputDataset, device: Union[str, torch.device]) -> TrainingPixels:

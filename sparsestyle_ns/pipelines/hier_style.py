@@ -82,19 +82,20 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
         for name, weight in self.loss_weights.items():
             if name not in LOSSES:
-                known = ", ".join(LOSSES)
-                raise InputError(f"--pipeline.loss-weights names {name}, which is no loss; the losses are {known}.")
+                raise InputError(
+                    f"--pipeline.loss-weights names {name}, which is no loss; the losses are {', '.join(LOSSES)}."
+                )
             if not 0.0 <= weight < math.inf:
                 raise InputError(f"--pipeline.loss-weights.{name} is {weight}; give a finite number, 0 or more.")
         if not any(self.loss_weights.values()):
             raise InputError("--pipeline.loss-weights turns every loss off; give one of them a weight above 0.")
 
-    def targets_of(self, style: StyleInputs) -> StyleTargets:
-        """A painting as a feature network on its device sees it, with these settings."""
-        image = style.painting.pixels.to(next(style.backbone.parameters()).device)
+    def targets_of(self, style: StyleInputs, device: torch.device) -> StyleTargets:
+        """A painting as the feature network sees it, with these settings; the network moves to the device."""
+        image, backbone = style.painting.pixels.to(device), style.backbone.to(device)
         losses = [name for name, weight in self.loss_weights.items() if weight > 0]
         side = self.style_side or self.feature_side
-        return StyleTargets(style.backbone, image, self.feature_side, side, self.style_features, losses)
+        return StyleTargets(backbone, image, self.feature_side, side, self.style_features, losses)
 
     def weights_at(self, step: int) -> Dict[str, float]:
         """The weight of each loss in an iteration; that of the content loss is λ(t) (Eq. 6)."""
@@ -104,15 +105,8 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         return weights
 
 
-@dataclass
-class StyleTask:
-    """A field that is on its way to a painting.
-
-    Attributes:
-        style: the field.
-        targets: the painting.
-        views: what it is stylised on; in turn, one an iteration.
-    """
+class StyleTask(NamedTuple):
+    """A field that is on its way to a painting, and the views that it is stylised on; in turn, one an iteration."""
 
     style: nn.Module
     targets: StyleTargets
@@ -141,22 +135,17 @@ class HierStylePipeline(CheckedPipeline):
 
     def freeze_views(self) -> SceneViews:
         """The scene's views, with all that depends on no style."""
-        config, manager = self.config, self.datamanager
-        return SceneViews(
-            self.model,
-            manager.pixels,
-            manager.train_dataset.cameras,
-            config.novel_views,
-            config.samples_per_chunk,
-            config.cache_gigabytes,
-        )
+        config, photos = self.config, self.datamanager.pixels
+        cameras = self.datamanager.train_dataset.cameras
+        sizes = config.novel_views, config.samples_per_chunk, config.cache_gigabytes
+        return SceneViews(self.model, photos, cameras, *sizes)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> List[TrainingCallback]:
         """Prepares the style and the views, as far as they aren't there already."""
         if self.targets is None:
-            self.targets = self._on_device(self.style_inputs or self.config.load_style())
+            self.targets = self.config.targets_of(self.style_inputs or self.config.load_style(), self.device)
         self.announce(self.targets.backbone)
         self.task = self.new_task(self.model.residual, self.targets, self.effects)
         say(self.scene_views.report())
@@ -170,10 +159,7 @@ class HierStylePipeline(CheckedPipeline):
         if path is None or not path.is_file():
             say(f"The painting {path} isn't there any more, so nothing is measured against it.")
             return None
-        return self._on_device(replace(self.config, style_image=path).load_style())
-
-    def _on_device(self, style: StyleInputs) -> StyleTargets:
-        return self.config.targets_of(StyleInputs(style.painting, style.backbone.to(self.device)))
+        return self.config.targets_of(replace(self.config, style_image=path).load_style(), self.device)
 
     def warm_start_loss(self, task: StyleTask, step: int) -> Dict[str, Float[Tensor, ""]]:
         """How far c_f, on the coarse geometry, is from the content picture of one photo.

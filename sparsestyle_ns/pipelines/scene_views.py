@@ -1,10 +1,7 @@
-"""The views that stage 2 stylises: their rays, frozen, and the pictures that they must stay like.
-
-`SceneView` holds what depends on no painting, and is shared by all styles of a scene; `ContentView` adds what does.
-"""
+"""The views that stage 2 stylises: their rays, frozen, and the pictures that they must stay like."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import List, Optional
 
 import psutil
@@ -26,41 +23,22 @@ from sparsestyle_ns.utils.progress import track
 
 
 @dataclass
-class SceneView:
-    """A view that is stylised, as far as it depends on no style.
-
-    Attributes:
-        frozen: its rays, ready to render.
-        picture: its photo at the mean exposure, or its coarse render.
-        accumulation: how opaque the coarse field is in each pixel.
-        features: the feature network's view of the picture, once a style has asked for it.
-    """
-
-    frozen: FrozenView
-    picture: Float[Tensor, "H W 3"]
-    accumulation: Float[Tensor, "H W"]
-    features: Optional[Float[Tensor, "1 C h w"]] = None
-
-
-@dataclass
 class ContentView:
-    """A view that is stylised, and what it must stay like.
-
-    Attributes:
-        frozen: its rays, ready to render.
-        picture: its photo or coarse render, in the painting's colours where the palette is transferred.
-        features: the feature network's view of it.
-        accumulation: how opaque the coarse field is in each pixel; None where there is no background behind it.
-    """
+    """A view that is stylised, and what it must stay like."""
 
     frozen: FrozenView
+    """Its rays, ready to render."""
     picture: Float[Tensor, "H W 3"]
-    features: Float[Tensor, "1 C h w"]
+    """Its photo at the mean exposure, or its coarse render; for a painting, in its colours where the palette is
+    transferred."""
     accumulation: Optional[Float[Tensor, "H W"]]
+    """How opaque the coarse field is in each pixel; for a painting None where there is no background behind it."""
+    features: Optional[Float[Tensor, "1 C h w"]] = None
+    """The feature network's view of the picture, once a painting has asked for it."""
 
 
 class SceneViews:
-    """All views of a scene: its training photos and, after them, views between these.
+    """All views of a scene, with what depends on no painting: its training photos and, after them, views between these.
 
     Args:
         model: whose coarse field is final.
@@ -83,19 +61,14 @@ class SceneViews:
     ) -> None:
         self.model, self.samples_per_chunk = model, samples_per_chunk
         self.num_photos = len(pixels.sizes)
-        self._bytes_left = self._cache_bytes(cache_gigabytes)
-        self.views: List[SceneView] = [
-            self._photo_view(pixels, index) for index in track(range(self.num_photos), "Caching views")
-        ]
+        if cache_gigabytes is None:
+            on_gpu = model.device.type == "cuda"
+            free = torch.cuda.mem_get_info()[0] if on_gpu else psutil.virtual_memory().available
+            cache_gigabytes = free / 2**30 / 4 / num_processes()
+        self._bytes_left = cache_gigabytes * 2**30
+        self.views = [self._photo_view(pixels, index) for index in track(range(self.num_photos), "Caching views")]
         novel = cameras_between(cameras, novel_views)
         self.views += [self._novel_view(camera) for camera in track(novel, "Caching novel views")]
-
-    def _cache_bytes(self, gigabytes: Optional[float]) -> float:
-        if gigabytes is not None:
-            return gigabytes * 2**30
-        on_gpu = self.model.device.type == "cuda"
-        free = torch.cuda.mem_get_info()[0] if on_gpu else psutil.virtual_memory().available
-        return free / 4 / num_processes()
 
     def _freeze(self, origins: Tensor, directions: Tensor) -> FrozenView:
         """The rays of a view that this process renders."""
@@ -104,7 +77,7 @@ class SceneViews:
         self._bytes_left -= frozen.kept_bytes
         return frozen
 
-    def _photo_view(self, pixels: TrainingPixels, index: int) -> SceneView:
+    def _photo_view(self, pixels: TrainingPixels, index: int) -> ContentView:
         height, width = pixels.sizes[index]
         rows = slice(pixels.starts[index], pixels.starts[index + 1])
         frozen = self._freeze(pixels.origins[rows], pixels.directions[rows])
@@ -112,40 +85,30 @@ class SceneViews:
         colors, exposure = pixels.colors[rows], self.model.exposure
         if exposure is not None:
             colors = exposure.undone(colors, seen_behind(accumulation, self.model.background), index)
-        return SceneView(frozen, colors.view(height, width, 3), accumulation.view(height, width))
+        return ContentView(frozen, colors.view(height, width, 3), accumulation.view(height, width))
 
-    def _novel_view(self, camera: Cameras) -> SceneView:
+    def _novel_view(self, camera: Cameras) -> ContentView:
         bundle = camera.generate_rays(camera_indices=0, keep_shape=True).to(self.model.device)
         rays = bundle.flatten()
         with self.model.rendering("exact"):  # a viewer may restyle a run whose pictures are baked
             outputs = self.model.get_outputs_for_camera_ray_bundle(bundle)
         frozen = self._freeze(rays.origins, rays.directions)
-        return SceneView(frozen, outputs["rgb_coarse"], outputs["accumulation_coarse"].squeeze(-1))
+        return ContentView(frozen, outputs["rgb_coarse"], outputs["accumulation_coarse"].squeeze(-1))
 
     @torch.no_grad()
     def for_painting(self, targets: StyleTargets, effects: Decisions) -> List[ContentView]:
         """The views with what they must stay like for one painting."""
-        pictures = [view.picture for view in self.views]
         if effects.on("palette"):
-            pictures = self._in_style_colors(targets)
-        return [
-            ContentView(
-                view.frozen,
-                picture,
-                self._features(view, picture, targets),
-                None if self.model.background is None else view.accumulation,
-            )
-            for view, picture in zip(self.views, pictures, strict=True)
-        ]
-
-    @staticmethod
-    def _features(view: SceneView, picture: Tensor, targets: StyleTargets) -> Tensor:
-        """Content features; those of a view's own picture are the same for every painting."""
-        if picture is not view.picture:
-            return targets.features(picture)
-        if view.features is None:
-            view.features = targets.features(picture)
-        return view.features
+            views = [
+                replace(view, picture=picture, features=targets.features(picture))
+                for view, picture in zip(self.views, self._in_style_colors(targets), strict=True)
+            ]
+        else:
+            views = self.views
+            for view in views:
+                if view.features is None:  # the same for every painting
+                    view.features = targets.features(view.picture)
+        return views if self.model.background is not None else [replace(view, accumulation=None) for view in views]
 
     def _in_style_colors(self, targets: StyleTargets) -> List[Tensor]:
         """Pictures with the painting's colours; where the scene is transparent the background stays as it is."""

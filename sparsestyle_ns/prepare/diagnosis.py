@@ -8,14 +8,14 @@ lies in the middle of the picture, it moved along its line of sight.
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Dict, List, Optional, Sequence, Set, Tuple
+from typing import Dict, List, Optional, Sequence, Tuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from sparsestyle_ns.data.features import Features, find_features, mutual_matches
+from sparsestyle_ns.data.features import Features, find_features, linked_groups, mutual_matches
 from sparsestyle_ns.utils.progress import track
 
 COMPARED_SIDE = 1000
@@ -39,14 +39,12 @@ class Pair:
     """What two photos have in common.
 
     Attributes:
-        matches: features that look alike.
-        agreeing: those that agree on one geometry.
+        agreeing: matched features that agree on one geometry.
         flat: share of the agreeing ones that a homography explains.
         epipole: where the second camera lies in the first photo, as an offset from the middle in longer sides; None
             where a homography explains everything.
     """
 
-    matches: int
     agreeing: int
     flat: float
     epipole: Optional[Float[np.ndarray, "2"]]
@@ -89,18 +87,18 @@ def compare(first: Features, second: Features, shape: Sequence[int]) -> Pair:
     here, there = mutual_matches(first.descriptors, second.descriptors, MAX_RATIO)
     start, end = first.points[here], second.points[there]
     if len(start) < MIN_MATCHES:
-        return Pair(len(start), 0, 0.0, None)
+        return Pair(0, 0.0, None)
     cv2.setRNGSeed(0)  # the same photos get the same verdict
     matrix, inliers = cv2.findFundamentalMat(start, end, cv2.USAC_MAGSAC, EPIPOLAR_ERROR, 0.999, 10_000)
     if matrix is None or matrix.shape != (3, 3) or inliers.sum() < MIN_MATCHES:
-        return Pair(len(start), 0 if inliers is None else int(inliers.sum()), 0.0, None)
+        return Pair(0 if inliers is None else int(inliers.sum()), 0.0, None)
     agree = inliers.ravel() > 0
     _, explained = cv2.findHomography(start[agree], end[agree], cv2.RANSAC, FLAT_ERROR, maxIters=5_000)
     flat = 0.0 if explained is None else float(explained.mean())
     homogeneous = np.linalg.svd(matrix)[2][-1]
     middle = 0.5 * np.array([shape[1], shape[0]])
     point = homogeneous[:2] / (homogeneous[2] if abs(homogeneous[2]) > 1e-12 else 1e-12)
-    return Pair(len(start), int(agree.sum()), flat, (point - middle) / max(shape))
+    return Pair(int(agree.sum()), flat, (point - middle) / max(shape))
 
 
 def _faint(features: Sequence[Features], names: Sequence[str]) -> List[str]:
@@ -113,7 +111,8 @@ def _faint(features: Sequence[Features], names: Sequence[str]) -> List[str]:
 
 
 def _unlinked(pairs: Dict[Tuple[int, int], Pair], names: Sequence[str]) -> List[str]:
-    groups = sorted(linked_groups(pairs, len(names)), key=lambda group: (-len(group), min(group)))
+    links = [ids for ids, pair in pairs.items() if pair.linked]
+    groups = sorted(linked_groups(len(names), links), key=lambda group: (-len(group), min(group)))
     if len(groups) == len(names):
         return [
             "No two photos share enough: they have too few matches to tell where the camera stood; take photos that "
@@ -131,28 +130,16 @@ def _unlinked(pairs: Dict[Tuple[int, int], Pair], names: Sequence[str]) -> List[
     return sentences
 
 
-def linked_groups(pairs: Dict[Tuple[int, int], Pair], count: int) -> List[Set[int]]:
-    """Photos that are linked to each other, directly or by way of others."""
-    groups = [{index} for index in range(count)]
-    for (first, second), pair in pairs.items():
-        if pair.linked:
-            one, other = (next(group for group in groups if index in group) for index in (first, second))
-            if one is not other:
-                groups.remove(other)
-                one |= other
-    return groups
-
-
 def _without_depth(pairs: Dict[Tuple[int, int], Pair], names: Sequence[str]) -> List[str]:
     linked = [pair for pair in pairs.values() if pair.linked]
     if not linked:
         return []
     if not any(pair.has_depth for pair in linked):
         return [
-            "The camera turned without moving, or all that it sees is flat or far away: the photos differ as if they "
-            "were bent, and no depth can be told; take a step to the side between photos."
+            "The camera turned without moving, or all that it sees is flat or far away: each photo is a "
+            "warped copy of another, from which depth can't be told; take a step to the side between photos."
         ]
-    # A short move's epipole is uncertain, so that one pair may have it anywhere.
+    # A short move's epipole is uncertain, so one pair alone says little.
     if np.median([np.linalg.norm(pair.epipole) for pair in linked if pair.has_depth]) < AXIS_SHARE:
         return [
             "The camera moved only along its line of sight, where what is in the middle looks the same from "

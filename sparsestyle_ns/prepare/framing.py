@@ -1,4 +1,4 @@
-"""Reading photos as cameras and telephones leave them, and bringing them to one size."""
+"""Reading photos as cameras and phones store them, and bringing them to one size."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,8 +26,8 @@ class Photo:
     Attributes:
         path: its file.
         image: its pixels, RGB, or RGBA where any are transparent.
-        orientation: how EXIF says that the stored pixels lie, from 1 (upright) to 8; 1 where it doesn't say.
-        upright: whether `image` was turned by that, where it says anything; else it has the pixels as they are stored.
+        orientation: EXIF's, from 1 (upright) to 8; 1 where it says nothing.
+        upright: whether `image` was turned by that; else it has the pixels as they are stored.
     """
 
     path: Path
@@ -51,11 +51,6 @@ class Framing:
     scaled: Size
     corner: Tuple[int, int]
     size: Size
-
-    @property
-    def scale(self) -> Tuple[float, float]:
-        """By how much focal lengths in pixels grow, across and down."""
-        return self.scaled[0] / self.original[0], self.scaled[1] / self.original[1]
 
     def apply(self, image: Image.Image) -> Image.Image:
         """The photo as it goes into the scene."""

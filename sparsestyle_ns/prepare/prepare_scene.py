@@ -31,13 +31,7 @@ PoseSource = Literal["auto", "file", "colmap"]
 
 @dataclass
 class PreparedScene:
-    """What `prepare_scene` made.
-
-    Attributes:
-        folder: the scene.
-        parser: the dataparser that reads it.
-        names: its photos' file names.
-    """
+    """What `prepare_scene` made: its folder, the dataparser that reads it, and its photos' file names."""
 
     folder: Path
     parser: str
@@ -47,9 +41,8 @@ class PreparedScene:
 def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> PreparedScene:
     """Makes a scene of photos: of one size, with poses.
 
-    Photos without poses are turned upright; poses from a file decide how their photos lie.
-
-    What is wrong with the photos is printed, a line each; it stops nothing.
+    Photos without poses are turned upright; photos with poses from a file stay as the poses are for them. What is wrong
+    with the photos is printed, a line each, and stops nothing.
 
     Args:
         photos: their folder.
@@ -71,10 +64,8 @@ def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> Pr
     _say_what_is_turned(read, poses)
     framings = frame_photos([photo.image.size for photo in read])
     _say_what_changes(framings)
-    findings = check_photos(
-        [framing.apply(photo.image) for photo, framing in zip(read, framings, strict=True)],
-        [path.name for path in paths],
-    )
+    framed = [framing.apply(photo.image) for photo, framing in zip(read, framings, strict=True)]
+    findings = check_photos(framed, [path.name for path in paths])
     for sentence in findings:
         print(f"Warning: {sentence}", flush=True)
     if poses is None:
@@ -89,7 +80,7 @@ def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> Pr
                 names = write_photos(read, framings, scene / "images")
                 poses.write(scene, names, framings)
             else:
-                names = write_photos(read, framings, Path(folder) / "photos")
+                write_photos(read, framings, Path(folder) / "photos")
                 names = run_colmap(Path(folder) / "photos", scene, [path.name for path in paths], findings)
             if output.exists():
                 output.rmdir()
@@ -127,17 +118,15 @@ def _say_what_is_turned(photos: Sequence[Photo], poses: Optional[Poses]) -> None
     """Prints what was done with photos that aren't stored upright, a line for each way."""
     told: Dict[str, List[str]] = {}
     for photo in photos:
+        words = "turned upright, as EXIF says"
+        if not photo.upright:
+            words = f"not turned, though EXIF says so, since poses in {poses.path} are for photos as they are stored"
+        elif poses is not None:
+            words += f", since only then the shape is that of the pose in {poses.path}"
         if photo.orientation != 1:
-            told.setdefault(_how_turned(photo, poses), []).append(photo.path.name)
+            told.setdefault(words, []).append(photo.path.name)
     for words, names in told.items():
         print(f"{', '.join(names)}: {words}")
-
-
-def _how_turned(photo: Photo, poses: Optional[Poses]) -> str:
-    if not photo.upright:
-        return f"not turned, though EXIF says so, since poses in {poses.path} are for photos as they are stored"
-    reason = "" if poses is None else f", since only then the shape is that of the pose in {poses.path}"
-    return f"turned upright, as EXIF says{reason}"
 
 
 def _say_what_changes(framings: Sequence[Framing]) -> None:
@@ -175,9 +164,9 @@ def run_colmap(photos: Path, scene: Path, originals: Sequence[str], findings: Se
         InputError: COLMAP found the place of fewer than three photos.
     """
     put_ffmpeg_on_path()
-    beside = Path(sys.executable).with_name("ns-process-data")
+    program = shutil.which("ns-process-data") or str(Path(sys.executable).with_name("ns-process-data"))
     command = [
-        *(shutil.which("ns-process-data") or str(beside), "images", "--data", str(photos), "--output-dir", str(scene)),
+        *(program, "images", "--data", str(photos), "--output-dir", str(scene)),
         *("--matching-method", "exhaustive", "--num-downscales", "0"),
         "--gpu" if torch.cuda.is_available() else "--no-gpu",
     ]

@@ -6,9 +6,8 @@ pipeline, optimisers and schedulers; here also notes on what made it.
 
 import copy
 import re
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Optional
+from typing import Any, Dict, List, Mapping, Optional, TypedDict
 
 import numpy as np
 import torch
@@ -20,32 +19,19 @@ from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 
 
-@dataclass
-class CheckpointNotes:
-    """What a checkpoint says beside the state: numbers and words only.
+class CheckpointNotes(TypedDict, total=False):
+    """What a checkpoint says beside the state: numbers and words only, and nothing of what isn't known."""
 
-    Attributes:
-        effects: the decisions about the scene's effects, as `Decisions.records` gives them.
-        backbone: which feature network took part, if one did: name, source and sha256.
-        coarse_run: folder of the coarse run that a stylised run builds on.
-        coarse_field: settings of the coarse field in a stylised run.
-        fine_encoding: what the residual field sees of a position.
-    """
-
-    effects: List[Dict[str, Any]] = field(default_factory=list)
-    backbone: Optional[Dict[str, str]] = None
-    coarse_run: Optional[str] = None
-    coarse_field: Optional[Dict[str, Any]] = None
-    fine_encoding: Optional[str] = None
-
-    @classmethod
-    def of(cls, state: Mapping[str, Any]) -> "CheckpointNotes":
-        """The notes in a checkpoint's content."""
-        return cls(**{name: state[name] for name in cls.__dataclass_fields__ if name in state})
-
-    def entries(self) -> Dict[str, Any]:
-        """What is written; nothing of what isn't known."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
+    effects: List[Dict[str, Any]]
+    """`Decisions.records` of the scene."""
+    backbone: Dict[str, str]
+    """Name, source and sha256 of the feature network that took part."""
+    coarse_run: str
+    """Folder of the run that a stylised run builds on."""
+    coarse_field: Dict[str, Any]
+    """Settings of the coarse field in a stylised run."""
+    fine_encoding: str
+    """What the residual field sees of a position."""
 
 
 def checkpoint_step(path: Path) -> int:
@@ -96,12 +82,11 @@ def write_checkpoint(
     Args:
         path: of the checkpoint.
         step: the last iteration that was done.
-        pipeline: the pipeline's state.
+        pipeline: its state.
         optimizers: with their schedulers.
         notes: what made it.
         scaler: of gradients; None: one that is off.
-        unfinished: where the file stands until it is whole. nerfstudio takes every file in the folder of checkpoints
-            for one.
+        unfinished: see `write_whole`; nerfstudio takes every file in the folder of checkpoints for one.
 
     Raises:
         InputError: a number in the state isn't finite.
@@ -119,7 +104,7 @@ def write_checkpoint(
         "optimizers": {name: part.state_dict() for name, part in optimizers.optimizers.items()},
         "schedulers": {name: part.state_dict() for name, part in optimizers.schedulers.items()},
         "scalers": (scaler or GradScaler(enabled=False)).state_dict(),
-        **notes.entries(),
+        **notes,
     }
     write_whole(path, lambda file: torch.save(without_numpy_scalars(state), file), unfinished)
 

@@ -1,47 +1,43 @@
 """Finding and reading the coarse run that a stylised run builds on."""
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Callable, Dict, Iterable, List, Optional
+from typing import Callable, Dict, Iterable, List, NamedTuple, Optional
 
 import torch
-import yaml
 from jaxtyping import Float
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, load_checkpoint, newest_checkpoint
-from sparsestyle_ns.runs.run_folder import COARSE_METHOD
+from sparsestyle_ns.runs.run_folder import COARSE_METHOD, read_config
 from sparsestyle_ns.runs.scene_record import FILE_NAME, SceneRecord
 from sparsestyle_ns.utils.errors import InputError
 
 
-@dataclass
-class CoarseRun:
-    """A coarse-fewshot run on disk.
-
-    Attributes:
-        folder: the run's folder.
-        config: its config.yml.
-        checkpoint: its newest checkpoint.
-    """
+class CoarseRun(NamedTuple):
+    """A coarse-fewshot run on disk, with its newest checkpoint."""
 
     folder: Path
     config: TrainerConfig
     checkpoint: Path
 
     @property
+    def iterations(self) -> int:
+        """How many are done."""
+        return checkpoint_step(self.checkpoint) + 1
+
+    @property
     def is_finished(self) -> bool:
-        """Whether the newest checkpoint is that of the last iteration."""
-        return checkpoint_step(self.checkpoint) + 1 >= self.config.max_num_iterations
+        """Whether all iterations are done."""
+        return self.iterations >= self.config.max_num_iterations
 
     def in_words(self) -> str:
         """Where it is, and how far where it isn't finished."""
         if self.is_finished:
             return str(self.folder)
-        done, total = checkpoint_step(self.checkpoint) + 1, self.config.max_num_iterations
-        return f"{self.folder}, which isn't finished ({done} of {total} iterations)"
+        total = self.config.max_num_iterations
+        return f"{self.folder}, which isn't finished ({self.iterations} of {total} iterations)"
 
     def model_state(self) -> Dict[str, Tensor]:
         """The state of the run's model."""
@@ -67,18 +63,14 @@ def read_coarse_run(path: Path) -> CoarseRun:
         InputError: it isn't there, isn't a coarse-fewshot run, or has no checkpoint.
     """
     folder = path.parent if path.name == "config.yml" else path
-    config_path = folder / "config.yml"
-    if not config_path.is_file():
+    if not (folder / "config.yml").is_file():
         raise InputError(
             f"--coarse-run {path} has no config.yml; name the folder of a coarse-fewshot run, "
             "such as outputs/fern/coarse-fewshot/2026-01-31_120000."
         )
-    try:
-        config = yaml.load(config_path.read_text(), Loader=yaml.Loader)
-    except Exception as error:  # yaml builds arbitrary objects, so anything can go wrong in it
-        raise InputError(f"--coarse-run: {config_path} can't be read ({error}).") from error
-    if not isinstance(config, TrainerConfig) or not config.method_name.startswith(COARSE_METHOD):
-        method = getattr(config, "method_name", "no nerfstudio run")
+    config = read_config(folder)
+    method = getattr(config, "method_name", "no nerfstudio run")
+    if not method.startswith(COARSE_METHOD):
         raise InputError(f"--coarse-run {folder} is {method}; a coarse-fewshot run is needed.")
     checkpoint = newest_checkpoint(folder / config.relative_model_dir)
     if checkpoint is None:
@@ -103,13 +95,12 @@ def check_scene(run: CoarseRun, scene: SceneRecord) -> None:
 def find_coarse_run(output_dir: Path, methods: Iterable[str], scene: SceneRecord) -> Optional[CoarseRun]:
     """The newest finished run of a scene among the runs of some methods below an output folder; None without one."""
     found: List[CoarseRun] = []
-    for method in methods:
-        for record in output_dir.glob(f"*/{method}/*/{FILE_NAME}"):
-            try:
-                run = read_coarse_run(record.parent)
-                fits = scene.difference(SceneRecord.load(run.folder)) is None
-            except InputError:  # a damaged or unfinished neighbour is no reason to stop
-                continue
-            if fits and run.is_finished:
-                found.append(run)
+    for record in (path for method in methods for path in output_dir.glob(f"*/{method}/*/{FILE_NAME}")):
+        try:
+            run = read_coarse_run(record.parent)
+            check_scene(run, scene)
+        except InputError:  # a damaged, unfinished or other neighbour is no reason to stop
+            continue
+        if run.is_finished:
+            found.append(run)
     return max(found, key=lambda run: run.checkpoint.stat().st_mtime, default=None)

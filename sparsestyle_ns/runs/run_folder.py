@@ -1,9 +1,15 @@
-"""Runs on disk: finding the config of one."""
+"""Runs on disk: finding and reading the config of one. Without torch, so that commands say at once what is wrong."""
 
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import yaml
 
 from sparsestyle_ns.utils.errors import InputError
+
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import TrainerConfig
 
 COARSE_METHOD = "coarse-fewshot"
 """What the names of stage 1's methods start with."""
@@ -29,14 +35,23 @@ def find_config(run: Path, method: str = "") -> Path:
         what = "There is no run at" if not run.exists() else "There is no config.yml in"
         example = f"outputs/fern/{method or STYLE_METHOD}/2026-01-31_120000"
         raise InputError(f"{what} {run}; name a run's folder, such as {example}.")
-    try:
-        name = re.search(r"^method_name: *(\S+)", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} can't be read; name the folder of a run that ns-train made.") from error
+    name = re.search(r"^method_name: *(\S+)", path.read_text(encoding="utf-8", errors="replace"), flags=re.MULTILINE)
     if name is None:
         raise InputError(f"{path} is no config of a nerfstudio run; name the folder of a run that ns-train made.")
-    if not name[1].startswith((method,) if method else (COARSE_METHOD, STYLE_METHOD)):
-        raise InputError(
-            f"{run} is a run of {name[1]}; name a run of {method or COARSE_METHOD + ' or ' + STYLE_METHOD}."
-        )
+    expected = (method,) if method else (COARSE_METHOD, STYLE_METHOD)
+    if not name[1].startswith(expected):
+        raise InputError(f"{run} is a run of {name[1]}; name a run of {' or '.join(expected)}.")
     return path
+
+
+def read_config(folder: Path) -> "TrainerConfig":
+    """What is in the config.yml of a run's folder.
+
+    Raises:
+        InputError: it can't be read.
+    """
+    path = folder / "config.yml"
+    try:
+        return yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
+    except Exception as error:  # yaml builds arbitrary objects, so anything can go wrong in it
+        raise InputError(f"{path} can't be read ({error}); name the folder of a run that ns-train made.") from error

@@ -1,7 +1,7 @@
 """What a run was trained on, saved beside its config, so that a later run can tell whether it fits."""
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Dict, List, Optional
 
@@ -20,25 +20,19 @@ FILE_NAME = "scene.json"
 
 @dataclass
 class SceneRecord:
-    """The photos of a run.
-
-    Attributes:
-        data: folder or file of the scene, absolute.
-        view_ids: the training views' ids.
-        view_names: their file names.
-        scene_box: corners of the scene's box.
-        cameras: camera-to-world matrix, [3][4], of each training view, after the dataparser's scaling.
-        background_color: RGB behind the scene, or None.
-        effects: which of the effects that are decided on photos are on.
-    """
+    """The photos of a run."""
 
     data: str
+    """Folder or file of the scene, absolute."""
     view_ids: List[int]
     view_names: List[str]
     scene_box: List[List[float]]
+    """Its corners."""
     cameras: List[List[List[float]]]
-    background_color: Optional[List[float]] = None
-    effects: Dict[str, bool] = field(default_factory=dict)
+    """Camera-to-world matrix, [3][4], of each training view, after the dataparser's scaling."""
+    background_color: Optional[List[float]]
+    effects: Dict[str, bool]
+    """Which of the effects that are decided on photos are on."""
 
     def save(self, folder: Path) -> None:
         """Writes `scene.json` into a run's folder."""
@@ -62,8 +56,9 @@ class SceneRecord:
         if self.view_ids != other.view_ids or self.view_names != other.view_names:
             return f"it was trained on views {other.view_ids} ({', '.join(other.view_names)})"
         for name, on in self.effects.items():
-            if on != other.effects.get(name):
-                word = "on" if other.effects.get(name) else "off"
+            theirs = other.effects.get(name, False)
+            if on != theirs:
+                word = "on" if theirs else "off"
                 flag = f"--pipeline.effects.{name.replace('_', '-')} {word}"
                 return f"it was made with the effect {name} {word}, as by {flag}"
         if self.background_color != other.background_color:
@@ -75,13 +70,7 @@ class SceneRecord:
 
 
 def record_scene(data: Path, outputs: DataparserOutputs, effects: Decisions) -> SceneRecord:
-    """The record of a run.
-
-    Args:
-        data: folder or file of the scene.
-        outputs: its training views, as read by `read_scene`.
-        effects: what was decided about it.
-    """
+    """The record of a run on a scene's training views, as `read_scene` gives them."""
     background = background_color(effects)
     return SceneRecord(
         data=str(data.resolve()),

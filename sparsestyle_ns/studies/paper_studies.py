@@ -4,14 +4,14 @@ import shlex
 from pathlib import Path
 from typing import Sequence
 
-from sparsestyle_ns.data.parser_choice import check_parser
+from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.studies.options import StudyOptions
 from sparsestyle_ns.studies.page import study_page
 from sparsestyle_ns.studies.paper_runs import PaperRuns
 from sparsestyle_ns.studies.paper_tables import OF_METHODS, Comparison, ablations, needed_runs, study_sections
 from sparsestyle_ns.studies.runs import RunQueue
-from sparsestyle_ns.studies.study import Study, parse_dataparser
+from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.page import prepare_page, write_page
@@ -46,7 +46,6 @@ def check_options(options: StudyOptions) -> PaperRuns:
     Raises:
         InputError: something in the options can't be used.
     """
-    check_parser(options.parser)
     dataparser = parse_dataparser([options.parser], options.data)
     if not options.style_images:
         raise InputError("There is no painting; name at least one with --style-images.")

@@ -4,16 +4,13 @@ import copy
 import functools
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Mapping, Optional, Sequence, Tuple, TypeVar
+from typing import Literal, Mapping, Optional, Tuple, TypeVar
 
 import tyro
-from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 
-from sparsestyle_ns.data.parser_choice import MARKERS, marker_of
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.method_configs import method_config
-from sparsestyle_ns.utils.errors import InputError
 
 Stage = Literal["coarse-fewshot", "hier-style"]
 C = TypeVar("C")
@@ -124,21 +121,3 @@ def with_setting(config: C, place: str, value: object) -> C:
 def flag_of(place: str) -> str:
     """The flag by which ns-train sets what is at a place."""
     return "--" + place.replace("_", "-")
-
-
-def parse_dataparser(arguments: Sequence[str], data: Path) -> DataParserConfig:
-    """A dataparser's config from its name and options, as after ns-train; without them from what the folder holds.
-
-    Raises:
-        InputError: the scene isn't there, or nothing says which dataparser reads it.
-    """
-    if not data.exists():
-        raise InputError(f"There is no scene at --data {data}; name its folder.")
-    if not arguments:
-        marker = marker_of(data)
-        if marker is None:
-            raise InputError(
-                f"{data} has none of {', '.join(MARKERS)}, so the dataparser isn't known; name it last, such as colmap."
-            )
-        arguments = [MARKERS[marker]]
-    return tyro.cli(AnnotatedDataParserUnion, args=list(arguments), prog="sparsestyle")

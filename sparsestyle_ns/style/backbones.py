@@ -30,7 +30,7 @@ def load_backbone(name: str = "auto", weights: Optional[Path] = None) -> Backbon
     if weights is not None:
         return _load_file(name, Path(weights).expanduser())
     absent = ""
-    for kind in _candidates(name):
+    for kind in BACKBONES.values() if name == "auto" else (BACKBONES[name],):
         found = kind.find_weights()
         if found is not None:
             found = Weights(found.path, found.source + absent)
@@ -43,10 +43,6 @@ def load_backbone(name: str = "auto", weights: Optional[Path] = None) -> Backbon
 def available_backbone() -> Optional[str]:
     """The name of the network that `load_backbone()` gives; None where no weights are found or can be downloaded."""
     return next((kind.name for kind in BACKBONES.values() if kind.find_weights() is not None), None)
-
-
-def _candidates(name: str) -> tuple[Type[Backbone], ...]:
-    return tuple(BACKBONES.values()) if name == "auto" else (BACKBONES[name],)
 
 
 def _load_file(name: str, path: Path) -> Backbone:

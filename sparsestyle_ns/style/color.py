@@ -50,11 +50,15 @@ def gaussian_distance(
     W² = |μ_1 − μ_2|² + tr(Σ_1 + Σ_2 − 2 (Σ_1^½ Σ_2 Σ_1^½)^½).
     """
     first, second = first_covariance.double(), second_covariance.double()
-    variances, axes = torch.linalg.eigh(first)
-    root = (axes * variances.clamp_min(0).sqrt()) @ axes.T
+    root = _square_root(first)
     shared = torch.linalg.eigvalsh(root @ second @ root).clamp_min(0).sqrt().sum()
     spread = (first.trace() + second.trace() - 2 * shared).clamp_min(0)
     return ((first_mean.double() - second_mean.double()).square().sum() + spread).sqrt()
+
+
+def _square_root(covariance: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    variances, axes = torch.linalg.eigh(covariance)
+    return (axes * variances.clamp_min(0).sqrt()) @ axes.T
 
 
 def palette_transform(
@@ -73,10 +77,8 @@ def palette_transform(
     its gain is bounded, and directions in which the content has no variance are mapped to the style's mean.
 
     Args:
-        content_mean: μ_c.
-        content_covariance: Σ_c, symmetric, of colours in [0, 1].
-        style_mean: μ_s.
-        style_covariance: Σ_s, symmetric, of colours in [0, 1].
+        content_mean, content_covariance: μ_c and Σ_c, of colours in [0, 1].
+        style_mean, style_covariance: μ_s and Σ_s, of colours in [0, 1].
 
     Returns:
         A and b, in float64.
@@ -85,26 +87,17 @@ def palette_transform(
     spreads = variances.clamp_min(0).sqrt()
     gains = torch.where(spreads >= SMALLEST_SPREAD, 1 / spreads, spreads / SMALLEST_SPREAD**2)
     whitening = (axes * gains) @ axes.T
-
-    variances, axes = torch.linalg.eigh(style_covariance.double())
-    coloring = (axes * variances.clamp_min(0).sqrt()) @ axes.T
-
-    matrix = coloring @ whitening
+    matrix = _square_root(style_covariance.double()) @ whitening
     return matrix, style_mean.double() - matrix @ content_mean.double()
 
 
 def apply_palette(
-    colors: Float[Tensor, "*batch 3"],
-    matrix: Float[Tensor, "3 3"],
-    offset: Float[Tensor, "3"],
-    clamp: bool = False,
+    colors: Float[Tensor, "*batch 3"], matrix: Float[Tensor, "3 3"], offset: Float[Tensor, "3"], clamp: bool = False
 ) -> Float[Tensor, "*batch 3"]:
     """A c + b for every colour, in the colours' own dtype and on their device.
 
     Args:
-        colors: RGB in the last dimension.
-        matrix: A of `palette_transform`.
-        offset: b of `palette_transform`.
+        matrix, offset: A and b of `palette_transform`.
         clamp: whether to cut the result to [0, 1]. Left as it is, it has the style's exact mean and covariance, but
             may leave the range of colours a screen can show.
     """

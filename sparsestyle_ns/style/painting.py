@@ -26,17 +26,13 @@ class Painting:
 
     Everything Pillow reads is taken: JPEG (CMYK too), PNG (grey, palette, transparent, 16 bits without loss), WebP,
     TIFF and others; of an animation the first frame. Transparent pixels are laid over white. Colour profiles are not
-    applied.
-
-    Attributes:
-        name: of its file, without folders.
-        data: what is in the file.
-        pixels: RGB in [0, 1], float32, on the CPU, upright as its EXIF orientation says.
+    applied. `name` is its file's, without folders, and `data` what is in it.
     """
 
     name: str
     data: bytes
     pixels: Float[Tensor, "3 H W"]
+    """RGB in [0, 1], float32, on the CPU, upright as its EXIF orientation says."""
 
     @classmethod
     def read(cls, path: Union[str, Path]) -> "Painting":
@@ -51,11 +47,7 @@ class Painting:
 
     @classmethod
     def received(cls, name: str, data: bytes) -> "Painting":
-        """Takes what a browser sent over as the file `name`.
-
-        Raises:
-            InputError: see `read`.
-        """
+        """Takes what a browser sent over as the file `name`; raises as `read` does."""
         name = Path(name.replace("\\", "/")).name or "upload"
         return cls(name, data, _decode(data, name))
 
@@ -82,16 +74,6 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _decode(data: bytes, name: Union[str, Path]) -> Float[Tensor, "3 H W"]:
-    rgb = _decode_pixels(data, name)
-    height, width = rgb.shape[:2]
-    if min(height, width) < SMALLEST_SIDE:
-        raise InputError(
-            f"The style image {name} is {width} × {height} pixels: give one of at least {SMALLEST_SIDE} pixels a side."
-        )
-    return torch.from_numpy(rgb).permute(2, 0, 1).contiguous().clamp(0, 1)
-
-
-def _decode_pixels(data: bytes, name: Union[str, Path]) -> Float[np.ndarray, "H W 3"]:
     if not data:
         raise InputError(f"The style image {name} is an empty file: give an undamaged JPEG, PNG or WebP file.")
     try:
@@ -99,7 +81,7 @@ def _decode_pixels(data: bytes, name: Union[str, Path]) -> Float[np.ndarray, "H 
             # Pillow can say what is wrong with a damaged file; OpenCV only that there is no image.
             image.load()
             pixels = _decode_deep_png(data) if _is_deep_png(data) else _decode_with_pillow(image)
-            orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+            pixels = _turn_upright(_lay_over_white(pixels), image.getexif().get(ExifTags.Base.Orientation, 1))
     except UnidentifiedImageError as error:
         raise InputError(
             f"The style image {name} is in no known image format: give a JPEG, PNG or WebP file."
@@ -109,7 +91,12 @@ def _decode_pixels(data: bytes, name: Union[str, Path]) -> Float[np.ndarray, "H 
         raise InputError(
             f"The style image {name} cannot be read as an image ({error}): give an undamaged JPEG, PNG or WebP file."
         ) from error
-    return _turn_upright(_lay_over_white(pixels), orientation)
+    height, width = pixels.shape[:2]
+    if min(height, width) < SMALLEST_SIDE:
+        raise InputError(
+            f"The style image {name} is {width} × {height} pixels: give one of at least {SMALLEST_SIDE} pixels a side."
+        )
+    return torch.from_numpy(pixels).permute(2, 0, 1).contiguous().clamp(0, 1)
 
 
 def _is_deep_png(data: bytes) -> bool:
@@ -117,14 +104,15 @@ def _is_deep_png(data: bytes) -> bool:
     return data.startswith(b"\x89PNG\r\n\x1a\n") and data[24] == 16
 
 
+TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
+"""OpenCV's conversion for a picture of so many channels."""
+
+
 def _decode_deep_png(data: bytes) -> Float[np.ndarray, "H W channels"]:
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ValueError("its 16-bit PNG data cannot be decoded")
-    if pixels.ndim == 2:
-        pixels = pixels[..., None]
-    color = np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[..., 2::-1]
-    return _to_unit_range(np.concatenate([color, pixels[..., 3:]], axis=2))
+    return _to_unit_range(cv2.cvtColor(pixels, TO_RGB[1 if pixels.ndim == 2 else pixels.shape[2]]))
 
 
 def _decode_with_pillow(image: Image.Image) -> Float[np.ndarray, "H W channels"]:
@@ -140,10 +128,8 @@ def _to_unit_range(pixels: Shaped[np.ndarray, "H W channels"]) -> Float[np.ndarr
 
 
 def _lay_over_white(pixels: Float[np.ndarray, "H W channels"]) -> Float[np.ndarray, "H W 3"]:
-    if pixels.shape[2] == 3:
-        return pixels
     color, alpha = pixels[..., :3], pixels[..., 3:]
-    return color * alpha + (1 - alpha)
+    return color * alpha + (1 - alpha) if alpha.size else color
 
 
 def _turn_upright(pixels: Float[np.ndarray, "H W 3"], orientation: int) -> Float[np.ndarray, "H W 3"]:

@@ -2,12 +2,10 @@
 
 All hold the same model and see the same batch or view. Each renders its own share of the rays; pixels are then put
 together, so that every process has the whole picture and the same losses, and gradients are averaged before each step.
-What comes out is what one process gives, up to rounding, with the same settings.
+What comes out is what one process gives, up to rounding. With one process, functions return what they were given.
 
 nerfstudio would wrap the model in DistributedDataParallel instead. That averages gradients of calls of the model's
 `forward`, which a step of hier-style doesn't go through, and names what is in a checkpoint by the number of processes.
-
-With one process every function here returns what it was given.
 """
 
 import os
@@ -37,13 +35,9 @@ def shard_rays(rows: Shaped[Tensor, "rows ..."]) -> Shaped[Tensor, "own ..."]:
 
 
 def gather_rays(own: Float[Tensor, "own ..."], num_rows: int) -> Float[Tensor, "rows ..."]:
-    """All rows, of all processes' shares; differentiable in this process's own.
+    """All rows, from what became of each process's rows of `shard_rays`; differentiable in this process's own.
 
     Gradients count N-fold, so that their mean over the processes is the gradient of the whole.
-
-    Args:
-        own: what became of the rows of `shard_rays`, one for one.
-        num_rows: number of all rows.
     """
     return own if num_processes() == 1 else _GatherRays.apply(own, num_rows)
 

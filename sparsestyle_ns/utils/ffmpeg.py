@@ -14,10 +14,7 @@ from sparsestyle_ns.utils.errors import InputError
 def put_ffmpeg_on_path() -> None:
     """Puts the ffmpeg that the package imageio-ffmpeg carries on this process's PATH, if there is no other.
 
-    `ns-render` refuses to start without an `ffmpeg` there, whatever it is to write.
-
-    Raises:
-        InputError: neither exists.
+    `ns-render` refuses to start without an `ffmpeg` there, whatever it is to write; an `InputError` if neither exists.
     """
     if shutil.which("ffmpeg") is not None:
         return

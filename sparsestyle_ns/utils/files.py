@@ -21,7 +21,6 @@ def write_whole(
     which the next call overwrites. Folders on the way to it are made.
 
     Args:
-        target: the file to make or to replace.
         content: text, which is written in UTF-8, bytes, or a function that writes them into an open file.
         temporary: where the unfinished file stands, on the same disk; None: beside `target`, as NAME.unfinished.
 
@@ -50,8 +49,7 @@ def prepare_output(output_path: Path, what: str, example: str) -> None:
     """Makes the folder that a file is to be written to.
 
     Args:
-        output_path: the file.
-        what: what it is, for the sentence that says why it can't be written.
+        what: what the file is, for the sentence that says why it can't be written.
         example: a good name for such a file.
 
     Raises:
@@ -68,19 +66,7 @@ def prepare_output(output_path: Path, what: str, example: str) -> None:
 
 
 def write_output(output_path: Path, content: bytes, what: str, example: str) -> Path:
-    """Writes a file, which appears under its name only when it is whole; a failure leaves the one that was there.
-
-    Args:
-        output_path: the file; folders on the way to it are made.
-        content: all of it.
-        what, example: see `prepare_output`.
-
-    Returns:
-        The file's absolute path.
-
-    Raises:
-        InputError: it can't be written there.
-    """
+    """Writes a file as `write_whole` does, and returns its absolute path; arguments and errors of `prepare_output`."""
     prepare_output(output_path, what, example)
     unfinished = output_path.with_name(output_path.name + ".unfinished")
     try:

@@ -1,14 +1,14 @@
 """The machine that something is measured on: what it is, whether others use it, and how much memory is taken."""
 
+import contextlib
 import importlib.metadata
 import os
 import platform
-import resource
-import sys
+import re
 import threading
 import time
 from pathlib import Path
-from typing import Dict, List, Tuple, Union
+from typing import Dict, List, Tuple
 
 import psutil
 import torch
@@ -26,33 +26,19 @@ def synchronize(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def peak_bytes(device: torch.device) -> int:
-    """The most memory this process has had: of a GPU what torch had allocated, else all that was resident."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    status = Path("/proc/self/status")
-    if status.is_file():
-        # Unlike getrusage's figure, this one isn't inherited from the process that started this one.
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-
-
 class PeakMemory:
     """The most memory that is taken inside of the `with`, in bytes: resident on a CPU, torch's own on a GPU."""
 
     def __init__(self, device: torch.device) -> None:
-        self.device = device
-        self.bytes = 0
+        self.device, self.bytes = device, 0
 
     def __enter__(self) -> "PeakMemory":
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._look, daemon=True)
         if self.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self.device)
-        else:
-            self._thread.start()
+            return self
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -63,11 +49,10 @@ class PeakMemory:
         self._thread.join()
 
     def _look(self) -> None:
-        process = psutil.Process()
-        while True:
-            self.bytes = max(self.bytes, process.memory_info().rss)
-            if self._ended.wait(0.01):
-                return
+        ended = False
+        while not ended:
+            self.bytes = max(self.bytes, psutil.Process().memory_info().rss)
+            ended = self._ended.wait(0.01)
 
 
 def core_seconds() -> Tuple[float, float]:
@@ -82,23 +67,6 @@ def others_share(earlier: Tuple[float, float], later: Tuple[float, float]) -> fl
     """Share of all cores, in [0, 1], that other processes used between two readings of `core_seconds`."""
     cores, others = later[0] - earlier[0], later[1] - earlier[1]
     return min(1.0, max(0.0, others / max(cores, 1e-9)))
-
-
-class OtherLoad:
-    """How much of all cores other processes use: for a second before a benchmark, and on average while it runs."""
-
-    def __init__(self) -> None:
-        self.before = psutil.cpu_percent(interval=1.0) / 100
-        self._start = core_seconds()
-
-    def record(self) -> Dict[str, Union[float, bool]]:
-        """Both shares, in [0, 1], and whether the machine counts as busy."""
-        during = others_share(self._start, core_seconds())
-        return {
-            "before": round(self.before, 3),
-            "during": round(during, 3),
-            "busy": max(self.before, during) > BUSY_SHARE,
-        }
 
 
 class LoadWatch:
@@ -117,15 +85,10 @@ class LoadWatch:
         return self
 
     def __exit__(self, *error: object) -> None:
-        now = core_seconds()
-        window = SHORTEST_WINDOW * (os.cpu_count() or 1)
-        start = self._readings[-1]
-        for reading in reversed(self._readings):
-            start = reading
-            if now[0] - reading[0] >= window:
-                break
-        self._readings = [reading for reading in self._readings if reading[0] >= start[0]]
-        self.busy = others_share(start, now) > BUSY_SHARE
+        now, window = core_seconds(), SHORTEST_WINDOW * (os.cpu_count() or 1)
+        while len(self._readings) > 1 and now[0] - self._readings[1][0] >= window:
+            del self._readings[0]
+        self.busy = others_share(self._readings[0], now) > BUSY_SHARE
 
 
 def device_name(device: torch.device) -> str:
@@ -133,19 +96,14 @@ def device_name(device: torch.device) -> str:
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     information = Path("/proc/cpuinfo")
-    if information.is_file():
-        for line in information.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
+    found = re.search(r"model name\s*: (.+)", information.read_text()) if information.is_file() else None
+    return found[1].strip() if found else platform.processor() or platform.machine()
 
 
 def versions() -> Dict[str, str]:
     """Versions of Python and of the packages that matter, as far as they are installed."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
-        try:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return found

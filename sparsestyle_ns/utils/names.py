@@ -23,9 +23,7 @@ def free_name(name: str, taken: Iterable[str]) -> str:
 def safe_file_name(name: str, otherwise: str) -> str:
     """A file's name for any disk and shell: letters and digits of any script, spaces, and a few signs.
 
-    Args:
-        name: as it was given, without folders.
-        otherwise: what to take where nothing of it is left.
+    `name` is as it was given, without folders; `otherwise` is taken where nothing of it is left.
     """
     # Neither hidden, nor "..", nor an end that some file systems drop.
     allowed = re.sub(r"[^\w .,()+-]", "_", name).strip(" .") or otherwise

@@ -19,7 +19,6 @@ Pixels = UInt8[np.ndarray, "H W 3"]
 LOSSLESS_PIXELS = 200_000
 """Pictures with at most this many pixels go into a page as PNG, larger ones as JPEG."""
 EXAMPLE_NAME = "index.html"
-"""A good name for a page."""
 
 
 def render_page(template: str, package: str, **values: object) -> str:
@@ -53,34 +52,15 @@ def data_uri(pixels: Pixels) -> str:
 
 
 def bytes_uri(content: bytes, media_type: str) -> str:
-    """A file's bytes as a data URI.
-
-    Args:
-        media_type: what they are: video/mp4, image/svg+xml.
-    """
+    """A file's bytes as a data URI, of a media type such as video/mp4 or image/svg+xml."""
     return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
 
 
 def prepare_page(output_path: Path) -> None:
-    """Makes the folder that a page is to be written to.
-
-    Raises:
-        InputError: it can't be made or written to, or the page's name is that of a folder.
-    """
+    """Makes the folder that a page is to be written to; see `prepare_output`."""
     prepare_output(output_path, "The page", EXAMPLE_NAME)
 
 
 def write_page(page: str, output_path: Path) -> Path:
-    """Writes a page; the file appears under its name only when it is whole.
-
-    Args:
-        page: its HTML.
-        output_path: the file; folders on the way to it are made.
-
-    Returns:
-        The file's absolute path.
-
-    Raises:
-        InputError: it can't be written there.
-    """
+    """Writes a page's HTML and returns the file's absolute path; see `write_output`."""
     return write_output(output_path, page.encode(), "The page", EXAMPLE_NAME)

@@ -1,9 +1,8 @@
 """How far long work is, and how long it still takes: bars on a terminal, a line now and then in a log.
 
-All bars of a process are on one display, also those of several threads and bars within bars, so that none overwrites
-another and what is printed meanwhile appears above them. Of several processes that train together, the first shows
-them; where CONSOLE is quiet, nothing is shown. A process that was started by another one tells it how far it is in a
-file (see `progress_file`).
+All bars of a process are on one display, also those of several threads and bars within bars, and what is printed
+meanwhile appears above them. Of several processes that train together, the first shows them; where CONSOLE is quiet,
+nothing is shown. A process that was started by another one tells it how far it is in a file (see `progress_file`).
 """
 
 import math
@@ -36,18 +35,12 @@ SECONDS_BETWEEN_REPORTS = 1.0
 
 
 class Bar:
-    """One piece of work that is under way; made by `bar`."""
+    """One piece of work that is under way, a task of the display; made by `bar`."""
 
-    def __init__(
-        self, display: Progress, description: str, total: float, done: float, unit: str, visible: bool
-    ) -> None:
-        self._display, self._unit = display, f" {unit}" if unit else ""
-        visible = visible and total > 1
-        number = display.add_task(
-            description, total=total, completed=done, visible=visible, first=done, note="", unit=unit
-        )
-        self.task = next(task for task in display.tasks if task.id == number)
-        self._said, self._said_at = done, time.monotonic()
+    def __init__(self, display: Progress, task: Task) -> None:
+        self._display, self.task = display, task
+        self._unit = f" {task.fields['unit']}" if task.fields["unit"] else ""
+        self._said, self._said_at = task.completed, time.monotonic()
 
     def advance(self, steps: float = 1, note: Optional[str] = None) -> None:
         """Some more of it is done; `note`, where given, is shown behind the time left from now on."""
@@ -55,9 +48,8 @@ class Bar:
 
     def reach(self, done: float, note: Optional[str] = None) -> None:
         """So much of it is done in all."""
-        fields = {} if note is None else {"note": note}
         task = self.task
-        self._display.update(task.id, completed=done, **fields)
+        self._display.update(task.id, completed=done, note=task.fields["note"] if note is None else note)
         _report(self._display)
         if not self._display.disable or not task.visible or task.finished:
             return
@@ -65,12 +57,9 @@ class Bar:
         waited, share = time.monotonic() - self._said_at, (done - self._said) / task.total
         if waited >= most or (waited >= least and share >= SHARE_BETWEEN_LINES):
             self._said, self._said_at = done, time.monotonic()
-            left, note = seconds_left(task), task.fields["note"]
-            say(
-                f"{task.description}: {done:.0f} of {task.total:.0f}{self._unit} ({task.percentage:.0f}%)"
-                + ("" if left is None else f", {duration(left)} left")
-                + (f"; {note}" if note else "")
-            )
+            line = f"{task.description}: {done:.0f} of {task.total:.0f}{self._unit} ({task.percentage:.0f}%)"
+            left, note = time_left(task), task.fields["note"]
+            say(line + (f", {left}" if left else "") + (f"; {note}" if note else ""))
 
     def end(self) -> None:
         """Takes the bar away; work that took long and is finished leaves a line."""
@@ -83,17 +72,18 @@ class Bar:
 
 @contextmanager
 def bar(description: str, total: float, done: float = 0, unit: str = "", visible: bool = True) -> Iterator[Bar]:
-    """Shows how far some work is, within a `with`.
+    """Shows how far some work is, within a `with`; nothing is shown where there is one thing to do in all.
 
     Args:
         description: what is being done, a word or two.
-        total: how much there is to do; of one thing alone nothing is shown.
         done: how much of it was done before.
         unit: what is counted, for lines in a log.
-        visible: whether to show anything.
     """
     with _shared_display() as display:
-        one = Bar(display, description, total, done, unit, visible)
+        number = display.add_task(
+            description, total=total, completed=done, visible=visible and total > 1, first=done, note="", unit=unit
+        )
+        one = Bar(display, next(task for task in display.tasks if task.id == number))
         try:
             yield one
         finally:
@@ -114,12 +104,12 @@ def say(line: str) -> None:
         CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-def seconds_left(task: Task) -> Optional[float]:
-    """By the speed of the last minutes; while they say nothing, by the mean speed; None before anything is done."""
-    if task.time_remaining is not None:
-        return task.time_remaining
-    done = task.completed - task.fields["first"]
-    return None if done <= 0 or task.elapsed is None else task.elapsed / done * task.remaining
+def time_left(task: Task) -> str:
+    """By the speed of the last minutes; while they say nothing, by the mean speed; empty before anything is done."""
+    seconds, done = task.time_remaining, task.completed - task.fields["first"]
+    if seconds is None and done > 0 and task.elapsed is not None:
+        seconds = task.elapsed / done * task.remaining
+    return "" if seconds is None else f"{duration(seconds)} left"
 
 
 def duration(seconds: float) -> str:
@@ -135,12 +125,7 @@ class _TimeLeftColumn(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         """The time left, once it is known."""
-        left = seconds_left(task)
-        return Text("" if left is None else f"{duration(left)} left", style="progress.remaining")
-
-
-def _can_draw() -> bool:
-    return CONSOLE.is_terminal and not (CONSOLE.is_dumb_terminal or CONSOLE.quiet) and comms.is_main_process()
+        return Text(time_left(task), style="progress.remaining")
 
 
 _lock = threading.Lock()
@@ -166,6 +151,7 @@ def _shared_display() -> Iterator[Progress]:
     global _display, _users
     with _lock:
         if _display is None:
+            can_draw = CONSOLE.is_terminal and not (CONSOLE.is_dumb_terminal or CONSOLE.quiet)
             _display = Progress(
                 TextColumn("{task.description}", markup=False),
                 BarColumn(bar_width=30),
@@ -176,7 +162,7 @@ def _shared_display() -> Iterator[Progress]:
                 transient=True,
                 refresh_per_second=REFRESHES,
                 speed_estimate_period=SPEED_PERIOD,
-                disable=not _can_draw(),
+                disable=not (can_draw and comms.is_main_process()),
             )
             _display.start()
         _users += 1

@@ -8,7 +8,7 @@ import json
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Optional, Tuple
+from typing import Tuple
 
 PROGRESS_FILE = "SPARSESTYLE_PROGRESS_FILE"
 """Environment variable with the file's path; where it isn't set, nothing is written."""
@@ -16,13 +16,7 @@ PROGRESS_FILE = "SPARSESTYLE_PROGRESS_FILE"
 
 @dataclass(frozen=True)
 class Work:
-    """One piece of work that is under way.
-
-    Attributes:
-        description: what is being done, a word or two.
-        done, total: how much is done, of how much.
-        unit: what is counted; `iterations` for training itself.
-    """
+    """One piece of work that is under way; `unit` is what is counted, `iterations` for training itself."""
 
     description: str
     done: float
@@ -32,22 +26,14 @@ class Work:
 
 @dataclass(frozen=True)
 class ProgressReport:
-    """What a process says of its work.
-
-    Attributes:
-        works: what is under way, the outermost first.
-        failure: why the process ended without finishing, one sentence; empty while all is well.
-    """
+    """What a process says of its work: what is under way, the outermost first."""
 
     works: Tuple[Work, ...] = ()
     failure: str = ""
+    """Why the process ended without finishing, one sentence; empty while all is well."""
 
     def write(self, path: Path) -> None:
-        """Replaces the file.
-
-        Raises:
-            OSError: it can't be written.
-        """
+        """Replaces the file, or raises an `OSError`."""
         unfinished = path.with_name(path.name + ".unfinished")
         unfinished.write_text(json.dumps(asdict(self)), encoding="utf-8")
         os.replace(unfinished, path)  # without waiting for the disk: nobody reads it after a crash of the machine
@@ -62,15 +48,8 @@ class ProgressReport:
         return cls(tuple(Work(**work) for work in content["works"]), content["failure"])
 
 
-def progress_file() -> Optional[Path]:
-    """The file that this process is to write; None where nobody asked for one."""
-    name = os.environ.get(PROGRESS_FILE)
-    return Path(name) if name else None
-
-
 def report(content: ProgressReport) -> None:
     """Writes a report, where this process is to write one; work doesn't stop because it can't be written."""
-    path = progress_file()
-    if path is not None:
+    if os.environ.get(PROGRESS_FILE):
         with contextlib.suppress(OSError):
-            content.write(path)
+            content.write(Path(os.environ[PROGRESS_FILE]))

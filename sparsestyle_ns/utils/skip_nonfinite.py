@@ -14,12 +14,7 @@ from sparsestyle_ns.utils.distributed import average_gradients
 
 
 class Skipped(NamedTuple):
-    """Steps that weren't taken.
-
-    Attributes:
-        total: how many since the optimisers were made.
-        in_a_row: how many since the last one that was taken.
-    """
+    """How many steps weren't taken since the optimisers were made, and since the last one that was taken."""
 
     total: int
     in_a_row: int
@@ -35,12 +30,9 @@ def broken(parameters: Iterable[nn.Parameter]) -> Float[Tensor, ""]:
 
 
 def step_if_finite(optimizer: Optimizer, is_broken: Float[Tensor, ""]) -> bool:
-    """Prepares an optimiser for a step: with `is_broken` 1, parameters, means and step count stay as they are.
+    """Whether to call an optimiser's step; with `is_broken` 1, parameters, means and step count stay as they are.
 
-    Fused optimisers look at the flag where they run, so that nothing waits for a GPU.
-
-    Returns:
-        Whether the step is to be called; false for optimisers that can't look at the flag themselves.
+    Fused optimisers are called with the flag and look at it where they run, so that nothing waits for a GPU.
     """
     if getattr(optimizer, "_step_supports_amp_scaling", False):
         optimizer.found_inf = is_broken

@@ -12,10 +12,10 @@ from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
-from nerfstudio.cameras.camera_utils import get_interpolated_poses
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from sparsestyle_ns.core.camera_paths import at_poses, poses_between
 from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.rendering.baked import BakedVolume
@@ -30,23 +30,12 @@ RAYS_AT_ONCE = 1024
 
 def likely_cameras(cameras: Cameras) -> List[Cameras]:
     """Cameras that a viewer is likely to pass: those of the photos, then those on the way from each to the next."""
-    scale = SIDE / max(int(cameras.width.max()), int(cameras.height.max()))
-    between = []
-    for first, second in zip(range(len(cameras)), range(1, len(cameras)), strict=False):
-        ends = (cameras.camera_to_worlds[index].cpu().numpy() for index in (first, second))
-        poses = get_interpolated_poses(*ends, STEPS_BETWEEN + 2)[1:-1]
-        between += [cameras.camera_to_worlds.new_tensor(pose)[:3] for pose in poses]
-    poses = [*cameras.camera_to_worlds, *between]
-    found = [
-        Cameras(
-            camera_to_worlds=pose[None],
-            **{name: getattr(cameras, name)[:1] for name in ("fx", "fy", "cx", "cy", "width", "height")},
-        )
-        for pose in poses
-    ]
-    for camera in found:
-        camera.rescale_output_resolution(scale)
-    return found
+    gaps, steps, poses = len(cameras) - 1, STEPS_BETWEEN + 1, cameras.camera_to_worlds.cpu()
+    path = poses_between(poses, gaps * steps + 1) if gaps else poses
+    is_photo = torch.arange(len(path)) % steps == 0
+    found = at_poses(torch.cat([path[is_photo], path[~is_photo]]), cameras)
+    found.rescale_output_resolution(SIDE / int(max(found.width[0], found.height[0])))
+    return [found[index : index + 1] for index in range(len(found))]
 
 
 class Baker(threading.Thread):

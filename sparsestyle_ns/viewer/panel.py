@@ -18,13 +18,14 @@ from sparsestyle_ns.losses.stylization import Losses
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
 from sparsestyle_ns.rendering.look import RENDER_MODES, Look
 from sparsestyle_ns.rendering.mixing import Mix
+from sparsestyle_ns.runs.checkpoints import CheckpointNotes
 from sparsestyle_ns.runs.thumbnail import find_thumbnail
 from sparsestyle_ns.utils.names import free_name
 from sparsestyle_ns.viewer.adjustments import begin_at_central_photo, hide_frustums, keep_outputs
 from sparsestyle_ns.viewer.baking import Baker
 from sparsestyle_ns.viewer.effects_panel import add_effects
 from sparsestyle_ns.viewer.restyling_controls import Pace, RestylingControls
-from sparsestyle_ns.viewer.styles import Facts, Style, checkpoint_notes, style_facts
+from sparsestyle_ns.viewer.styles import Facts, Style, saved_notes, style_facts
 from sparsestyle_ns.viewer.texts import losses_text
 
 NO_BLEND = "nothing"
@@ -94,8 +95,10 @@ class StylePanel(ViewerControl):
         hint = "baked: quick from a voxel grid, once it has seen a place"
         self.mode = gui.add_dropdown("Render mode", RENDER_MODES, mode, hint=hint)
         self.split = gui.add_checkbox("Coarse | stylised", False)
-        for control in (self.strength, self.geometry, self.style, self.other, self.blend, self.mode):
+        for control in (self.strength, self.geometry, self.blend, self.mode):
             control.on_update(lambda _: self._changed())
+        self.style.on_update(lambda _: self._style_chosen())
+        self.other.on_update(lambda _: self._other_chosen())
         self.split.on_update(lambda _: self.apply_split())
         self.training = gui.add_markdown("", image_root=Path(), visible=False)
         self.restyling = RestylingControls(
@@ -138,12 +141,13 @@ class StylePanel(ViewerControl):
     def describe_run(self) -> None:
         """Says what made the run's own style, as far as it is known by now."""
         painting, trainer = self.pipeline.config.style_image, self.viewer.trainer
+        notes, iterations = CheckpointNotes(), None
         if trainer is None:
-            notes = checkpoint_notes(self.folder / "nerfstudio_models")
-        else:
-            notes = trainer.notes() if self.pipeline.targets is not None else {}
+            notes, iterations = saved_notes(self.folder / "nerfstudio_models")
+        elif self.pipeline.targets is not None:
+            notes = trainer.notes()
         own = self.styles[0]
-        own.facts = style_facts(None if painting is None else painting.name, str(self.folder), notes)
+        own.facts = style_facts(None if painting is None else painting.name, str(self.folder), notes, iterations)
         own.thumbnail = find_thumbnail(self.folder, painting)
         self.description.content = self._chosen().markdown()
 
@@ -188,9 +192,15 @@ class StylePanel(ViewerControl):
 
     def _changed(self) -> None:
         self._last_change = time.monotonic()
-        self.blend.visible = self.other.value != NO_BLEND
-        self.description.content = self._chosen().markdown()
         self.viewer._trigger_rerender()
+
+    def _style_chosen(self) -> None:
+        self.description.content = self._chosen().markdown()
+        self._changed()
+
+    def _other_chosen(self) -> None:
+        self.blend.visible = self.other.value != NO_BLEND
+        self._changed()
 
     def apply_split(self) -> None:
         """Shows the coarse field on the left and the stylised one on the right, or the stylised one alone."""

@@ -154,12 +154,7 @@ class RestylingControls:
 
     def _keep(self, restyling: Restyling) -> str:
         """Saves and shows the new style, which stays even where it can't be saved; returns what came of that."""
-        painting, workshop = restyling.image, restyling.workshop
-        notes = {
-            "step": restyling.iterations - 1,
-            "backbone": vars(workshop.backbone().description),
-            "coarse_run": str(workshop.pipeline.config.coarse_run),
-        }
+        painting = restyling.image
         try:
             run = str(restyling.save())
             ending = f"Saved as a run of its own: {plain(run)}"
@@ -169,7 +164,7 @@ class RestylingControls:
             reason = in_one_line(error)
             run = f"not saved ({reason})"
             ending = f"It is **not saved** ({plain(reason)}), and gone when the viewer ends."
-        facts = style_facts(painting.name, run, notes)
+        facts = style_facts(painting.name, run, restyling.notes(), restyling.iterations)
         name = self.add_style(Path(painting.name).stem, restyling.field, facts, painting.thumbnail())
         return f"**{plain(name)}** is ready. {ending}"
 

@@ -3,10 +3,10 @@
 import base64
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Dict, List, Optional, Tuple
+from typing import List, Optional, Tuple
 
 from sparsestyle_ns.fields.fine import StylisedField
-from sparsestyle_ns.runs.checkpoints import load_checkpoint, newest_checkpoint
+from sparsestyle_ns.runs.checkpoints import CheckpointNotes, load_checkpoint, newest_checkpoint
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.viewer.texts import plain
 
@@ -38,29 +38,30 @@ class Style:
         return "\n\n".join([*picture, *(f"**{name}** {plain(value)}" for name, value in self.facts)])
 
 
-def style_facts(painting: Optional[str], run: str, notes: Dict[str, Any]) -> Facts:
+def style_facts(painting: Optional[str], run: str, notes: CheckpointNotes, iterations: Optional[int] = None) -> Facts:
     """What made a style.
 
     Args:
         painting: its file's name.
         run: the run's folder, or why there is none.
         notes: of its checkpoint, or of its trainer.
+        iterations: how many it has behind it; None: not known yet.
     """
     facts = [("Painting", painting or "not known"), ("Run", run)]
-    if "step" in notes:
-        facts.append(("Iterations", str(notes["step"] + 1)))
-    if "backbone" in notes:
-        facts.append(("Features", "{name}, {source}".format(**notes["backbone"])))
-    if "coarse_run" in notes:
-        facts.append(("Coarse run", notes["coarse_run"]))
+    if iterations is not None:
+        facts.append(("Iterations", str(iterations)))
+    if notes.backbone is not None:
+        facts.append(("Features", "{name}, {source}".format(**notes.backbone)))
+    if notes.coarse_run is not None:
+        facts.append(("Coarse run", notes.coarse_run))
     return facts
 
 
-def checkpoint_notes(folder: Path) -> Dict[str, Any]:
-    """What the newest checkpoint in a folder says beside the state; nothing where there is none or it can't be read."""
+def saved_notes(folder: Path) -> Tuple[CheckpointNotes, Optional[int]]:
+    """What the newest checkpoint in a folder says, and its iterations; nothing where none can be read."""
     newest = newest_checkpoint(folder)
     try:
         state = {} if newest is None else load_checkpoint(newest)
     except InputError:
-        return {}
-    return {name: state[name] for name in ("step", "backbone", "coarse_run") if name in state}
+        state = {}
+    return CheckpointNotes.of(state), state["step"] + 1 if state else None

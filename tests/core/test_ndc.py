@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
+from reference import ndc_points
 
-from sparsestyle_ns.core.ndc import ndc_distance, ndc_parameter, ndc_points, ndc_rays
+from sparsestyle_ns.core.ndc import ndc_distance, ndc_parameter, ndc_rays
 
 FOCAL_OVER_HALF_SIZE = (1.6, 2.1)
 

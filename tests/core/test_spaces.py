@@ -5,7 +5,7 @@ import reference
 import torch
 from nerfstudio.data.scene_box import SceneBox
 
-from sparsestyle_ns.core.ndc import ndc_points, ndc_rays
+from sparsestyle_ns.core.ndc import ndc_rays
 from sparsestyle_ns.core.spaces import (
     MAX_DISTANCE,
     BoxSpace,
@@ -41,7 +41,7 @@ def forward_facing(scale=1.0):
     space = ForwardFacingSpace(SceneBox(aabb=box), FOCAL_OVER_HALF_SIZE, scale * NEAR)
 
     def to_field(points):
-        return (ndc_points(points, FOCAL_OVER_HALF_SIZE, scale * NEAR) - box[0]) / (box[1] - box[0]) * 2 - 1
+        return (reference.ndc_points(points, FOCAL_OVER_HALF_SIZE, scale * NEAR) - box[0]) / (box[1] - box[0]) * 2 - 1
 
     return space, scale * origins, directions, to_field
 
@@ -256,3 +256,13 @@ def test_the_longest_side_of_a_box_fills_the_cube_and_the_others_keep_their_prop
     torch.testing.assert_close(ends[0], torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))
     torch.testing.assert_close(ends[1], torch.tensor([[-0.4, 0.0, 0.0], [0.4, 0.0, 0.0]]))
     assert math.isclose(segments.lengths(torch.tensor([[0.0, 1.0]]))[1].item(), 0.8, rel_tol=1e-6)
+
+
+def test_a_camera_that_has_flown_into_a_forward_facing_scene_sees_what_is_ahead_of_it() -> None:
+    space = ForwardFacingSpace(SceneBox(torch.tensor([[-2.0, -2, -1], [2, 2, 1]])), (1.0, 1.0), 1.0, (1.5, 9.0))
+    origins = torch.tensor([[0.0, 0, 0], [0, 0, -3], [0, 0, -20]])
+    segments = space.segments(origins, torch.tensor([[0.0, 0, -1]]).expand(3, 3))
+    start, end = (segments.distance(torch.full((3, 1), s)).flatten() for s in (0.0, 1.0))
+    torch.testing.assert_close(start, torch.tensor([1.5, 0.0, 0.0]), rtol=0, atol=1e-4)
+    torch.testing.assert_close(end, torch.tensor([9.0, 6.0, 0.0]), rtol=0, atol=1e-4)
+    assert segments.hit.tolist() == [True, True, False]  # the last one has the whole scene behind it

@@ -9,6 +9,7 @@ import pytest
 import torch
 from conftest import decided
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
@@ -262,8 +263,8 @@ def test_without_a_semantic_loss_no_network_is_loaded_and_no_operation_is_run(
 
 
 def test_what_is_off_builds_nothing_and_reads_no_photo():
-    decisions, unread = decided("box"), Scene([Path("gone.png")], cameras=None, scene_box=BOX.aabb)
+    decisions, unread = decided("box"), Scene(DataparserOutputs([Path("gone.png")], cameras=None))
     assert background_color(decisions) is None
     assert build_exposure(decisions, num_photos=3) is None
     assert matched_rays(decisions, unread) is None
-    assert CoarseFieldConfig(**FIELD).setup(decisions).direction_encoding is None
+    assert CoarseFieldConfig(**FIELD).setup(decisions.on("view_color")).direction_encoding is None

@@ -14,6 +14,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.data.reading import read_scene
+from sparsestyle_ns.data.scene_info import select_outputs
 from sparsestyle_ns.effects.base import Decisions, EffectSettings
 from sparsestyle_ns.effects.registry import EFFECTS, decide, decide_again, decided_on_photos
 from sparsestyle_ns.effects.scene import Scene
@@ -29,7 +30,7 @@ PARSERS = {
 
 def training_views(folder: Path, layout: str = "llff") -> Scene:
     """All training views of a scene."""
-    return Scene.of(read_scene(PARSERS[layout](data=folder).setup()))
+    return Scene(read_scene(PARSERS[layout](data=folder).setup()))
 
 
 @pytest.fixture(scope="session")
@@ -97,7 +98,7 @@ def test_exposures_are_measured_as_they_were_made(made):
 
 def test_few_photos_are_not_enough_to_tell_shine_from_shape(made):
     scene = made("llff", *SEEN, "--shiny", "0.8")
-    few = dataclasses.replace(scene, filenames=scene.filenames[:3], cameras=scene.cameras[:3])
+    few = dataclasses.replace(scene, outputs=select_outputs(scene.outputs, (0, 1, 2)))
     decision = decide(few, EffectSettings())["view_color"]
     assert not decision.on
 

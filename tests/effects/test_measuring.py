@@ -1,11 +1,13 @@
 """What effects measure, against cases worked out by hand."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
 from sparsestyle_ns.data.features import mutual_matches
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
@@ -108,7 +110,7 @@ def test_of_other_cameras_effects_say_that_nothing_is_measured():
     kinds = torch.tensor([[CameraType.PERSPECTIVE.value], [CameraType.EQUIRECTANGULAR.value]])
     poses = torch.eye(4)[None, :3].repeat(2, 1, 1)
     cameras = Cameras(poses, 50.0, 50.0, 50.0, 25.0, 100, 50, camera_type=kinds)
-    scene = Scene([Path("a.png"), Path("b.png")], cameras, torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    scene = Scene(DataparserOutputs([Path("a.png"), Path("b.png")], cameras))
     scene.photos = [np.random.default_rng(index).uniform(size=(50, 100, 4)).astype(np.float32) for index in range(2)]
     for measure in (measure_exposure, measure_view_color, measure_matched_depth):
         found = measure(scene)
@@ -133,18 +135,14 @@ def test_colours_are_sampled_at_pixel_centres_and_between_them():
 def colour_matches(gains, outliers: int = 0) -> PointMatches:
     """A hundred grey points in each pair of photos with these gains, some of them of another colour in one."""
     generator = np.random.default_rng(1)
-    views, columns = len(gains), [[] for _ in range(6)]
-    for first in range(views):
-        for second in range(first + 1, views):
-            colors = generator.uniform(0.3, 0.6, (100, 3))
-            other = colors * gains[second]
-            other[:outliers] = generator.uniform(0, 1, (outliers, 3))
-            nowhere = np.zeros((100, 3))
-            for column, part in zip(
-                columns, (first, second, colors * gains[first], other, nowhere, nowhere), strict=True
-            ):
-                column.append(np.full(100, part) if np.isscalar(part) else part)
-    return PointMatches(*(np.concatenate(column) for column in columns), num_views=views)
+    pairs, seen = list(itertools.combinations(range(len(gains)), 2)), []
+    for first, second in pairs:
+        colors = generator.uniform(0.3, 0.6, (100, 3))
+        other = colors * gains[second]
+        other[:outliers] = generator.uniform(0, 1, (outliers, 3))
+        seen.append(np.stack([colors * gains[first], other]))
+    views, colors = np.repeat(np.array(pairs).T, 100, axis=1), np.concatenate(seen, axis=1)
+    return PointMatches(views, colors, directions=np.zeros_like(colors), num_views=len(gains))
 
 
 @pytest.mark.parametrize("outliers", [0, 20])
@@ -160,9 +158,9 @@ def test_gains_are_found_up_to_their_mean_even_among_points_that_differ(outliers
 def test_photos_that_hang_together_by_nothing_have_no_measurable_gain():
     whole = colour_matches(np.ones((4, 3)))
     assert whole.fewest_in_a_view() == 300
-    apart = (whole.first < 2) == (whole.second < 2)
-    parts = {name: part[apart] for name, part in vars(whole).items() if name != "num_views"}
-    assert PointMatches(**parts, num_views=4).fewest_in_a_view() == 0
+    apart = (whole.views[0] < 2) == (whole.views[1] < 2)
+    parts = (part[:, apart] for part in (whole.views, whole.colors, whole.directions))
+    assert PointMatches(*parts, num_views=4).fewest_in_a_view() == 0
 
 
 def test_rays_to_the_same_point_meet_at_their_distances_from_it():
@@ -171,16 +169,16 @@ def test_rays_to_the_same_point_meet_at_their_distances_from_it():
     origins = generator.uniform(3, 5, (2, 20, 3))
     expected = np.linalg.norm(points - origins, axis=-1)
     directions = (points - origins) / expected[..., None]
-    assert distances_along(origins[0], directions[0], origins[1], directions[1]) == pytest.approx(expected)
+    assert distances_along(origins, directions) == pytest.approx(expected)
     # Turned away from each other's side, the same lines meet behind the cameras.
-    behind = distances_along(origins[0], -directions[0], origins[1], -directions[1])
+    behind = distances_along(origins, -directions)
     assert behind == pytest.approx(-expected)
 
 
 def test_rays_that_pass_each_other_are_measured_where_they_come_nearest_and_parallel_ones_never():
     origins, ahead = np.array([[0.0, 0, 0], [0, 0, 0]]), np.array([[0.0, 0, -1], [0, 0, -1]])
     others, crossing = np.array([[-2.0, 0.5, -3], [1, 0, 0]]), np.array([[1.0, 0, 0], [0, 0, -1]])
-    first, second = distances_along(origins, ahead, others, crossing)
+    first, second = distances_along(np.stack([origins, others]), np.stack([ahead, crossing]))
     assert (first.tolist(), second.tolist()) == ([3.0, np.inf], [2.0, np.inf])
 
 
@@ -188,7 +186,7 @@ def test_points_of_a_made_scene_are_matched_at_their_true_depth(tmp_path):
     import make_sample_scene
 
     make_sample_scene.main([str(tmp_path), "--layout", "llff", "--width", "200", "--num-views", "5"])
-    scene = Scene.of(read_scene(LLFFDataParserConfig(data=tmp_path / "llff").setup()))
+    scene = Scene(read_scene(LLFFDataParserConfig(data=tmp_path / "llff").setup()))
     rays = triangulate(scene)
     assert len(rays) >= 200
     # Both rays of a point end in the same place, and nearly all between the bounds that the scene was made with.
@@ -217,7 +215,7 @@ def test_the_shift_by_a_lens_is_that_of_the_corner():
 def test_parameters_without_which_a_camera_has_no_rays_are_kept():
     cameras = lens(0.0)
     cameras.camera_type[:] = CameraType.FISHEYE624.value
-    found = measure_lens_distortion(Scene([Path("a.png")], cameras, torch.tensor([[-1.0] * 3, [1.0] * 3])))
+    found = measure_lens_distortion(Scene(DataparserOutputs([Path("a.png")], cameras)))
     assert (found.on, found.value) == (True, None)
 
 

@@ -139,7 +139,7 @@ def held_out_psnr(
 def test_an_effect_that_a_scene_calls_for_makes_held_out_views_better(scenes, layout, options, on, off):
     folder = scenes(layout, *options)
     with_it, without = (held_out_psnr(folder, layout, 300, effects) for effects in (on, off))
-    print(f"{layout} {options} {on}: {with_it:.2f} dB, {off}: {without:.2f} dB")  # README's table, by pytest -rP
+    print(f"{layout} {options} {on}: {with_it:.2f} dB, {off}: {without:.2f} dB")  # docs/effects.md's table
     assert with_it > without
 
 

@@ -10,6 +10,7 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.scripts import train
 from PIL import Image
 
+from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.engine.hints import (
     after_effects,
     after_evaluation,

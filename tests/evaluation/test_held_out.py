@@ -98,7 +98,7 @@ def test_the_command_leaves_the_report_in_the_runs_folder_and_says_what_follows(
     shutil.copytree(runs.style, moved)
     main(["evaluate", str(moved)])
     report = saved_report(moved, step=2)
-    assert report.num_views == 2
+    assert len(report.views) == 2
     assert "content_ssim" in report.means
     line = capsys.readouterr().out.splitlines()[-1]
     assert line == f"Made {moved / 'evaluation.json'} – next: sparsestyle gallery {moved}"

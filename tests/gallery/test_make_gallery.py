@@ -133,7 +133,7 @@ def test_a_run_without_a_report_is_measured_when_that_is_asked_for_and_keeps_it(
     shown = collect_run(moved, num_views=1, frames=0, evaluate=True)
     assert [table.title.split(",")[0] for table in shown.tables][:2] == ["Coarse field", "Style and content"]
     kept = saved_report(moved, 2)
-    assert kept.num_views == 2
+    assert len(kept.views) == 2
     assert json.loads((moved / "evaluation.json").read_text())["results"] == kept.means
     assert newest_checkpoint(moved / "nerfstudio_models").name == "step-000000002.ckpt"
 

@@ -5,9 +5,10 @@ import torch
 from conftest import decided
 from hard.table import hard_case
 from nerfstudio.data.scene_box import SceneBox
+from reference import ndc_points
 from torch.nn.functional import normalize
 
-from sparsestyle_ns.core.ndc import ndc_distance, ndc_points, ndc_rays
+from sparsestyle_ns.core.ndc import ndc_distance, ndc_rays
 from sparsestyle_ns.core.occupancy import DensityGrid, Occupancy, march
 from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.spaces import (

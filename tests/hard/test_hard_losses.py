@@ -270,7 +270,7 @@ def test_constant_images_have_finite_losses(backbone, value):
 def test_the_smallest_and_the_longest_style_have_features(backbone, height, width):
     style = torch.rand(3, height, width, generator=torch.Generator().manual_seed(0))
     targets = StyleTargets(backbone, style, feature_side=16, style_side=48)
-    assert min(fit_side(style[None], 48).shape[-2:]) >= 8
+    assert min(fit_side(style[None], 48, backbone.smallest_side).shape[-2:]) >= 8
     view = targets.view(torch.rand(16, 16, 3), targets.features(torch.rand(16, 16, 3)))
     assert targets.losses(view)["style"].isfinite()
 
@@ -284,8 +284,8 @@ def test_the_smallest_and_the_longest_style_have_features(backbone, height, widt
 @pytest.mark.parametrize("height", [1, 4, 7])
 def test_a_low_picture_of_the_right_width_is_enlarged(backbone, height):
     picture = torch.rand(1, 3, height, 32)
-    assert fit_side(picture, 32).shape == (1, 3, 8, 32)
-    assert feature_rows(backbone(fit_side(picture, 32))).isfinite().all()
+    assert fit_side(picture, 32, backbone.smallest_side).shape == (1, 3, 8, 32)
+    assert feature_rows(backbone(fit_side(picture, 32, backbone.smallest_side))).isfinite().all()
 
 
 @hard_case(

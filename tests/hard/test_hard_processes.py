@@ -14,7 +14,7 @@ from torch import nn
 from torch.amp import GradScaler
 
 from sparsestyle_ns.engine.loading import load_run
-from sparsestyle_ns.engine.optimizers import FusedAdamConfig
+from sparsestyle_ns.engine.training import FusedAdamConfig
 from sparsestyle_ns.runs.checkpoints import load_checkpoint, newest_checkpoint
 from sparsestyle_ns.utils import distributed as processes
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers

@@ -15,8 +15,8 @@ from torch import nn
 from torch.amp import GradScaler
 
 from sparsestyle_ns.core.occupancy import DensityGrid
-from sparsestyle_ns.engine.optimizers import FusedAdamConfig
 from sparsestyle_ns.engine.trainer import SparseStyleTrainer
+from sparsestyle_ns.engine.training import FusedAdamConfig
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
 from sparsestyle_ns.runs.checkpoints import load_checkpoint, newest_checkpoint

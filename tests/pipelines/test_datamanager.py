@@ -1,15 +1,21 @@
 """What the data manager makes of a scene's photos and cameras."""
 
 import shutil
+from dataclasses import dataclass, field, replace
+from typing import Type
 
 import numpy as np
 import pytest
 import torch
+from conftest import decided
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 from test_commands import write_ring, write_transforms
 
-from sparsestyle_ns.data.llff import LLFFDataParserConfig
+from sparsestyle_ns.data.llff import LLFFDataParser, LLFFDataParserConfig
+from sparsestyle_ns.data.scene_info import SCENE_INFO, SceneInfo, scene_info
+from sparsestyle_ns.effects.base import EffectSettings
+from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.utils.errors import InputError
 
@@ -70,3 +76,33 @@ def test_a_held_out_photo_that_cant_be_used_is_named_before_training(llff_scene,
     config = FewShotDataManagerConfig(data=scene, dataparser=LLFFDataParserConfig())
     with pytest.raises(InputError, match=r"image008\.png is black all over"):
         config.setup(device="cpu", test_mode="val")
+
+
+@dataclass
+class OwnDataParserConfig(LLFFDataParserConfig):
+    """A dataset that the data manager has never heard of."""
+
+    _target: Type = field(default_factory=lambda: OwnDataParser)
+
+
+class OwnDataParser(LLFFDataParser):
+    def _generate_dataparser_outputs(self, split="train", **kwargs):
+        outputs = super()._generate_dataparser_outputs(split, **kwargs)
+        info = SceneInfo(scene_info(outputs).view_ids, standard_views=(7, 2, 5), default_num_views=2)
+        return replace(outputs, metadata={SCENE_INFO: info})
+
+
+def test_a_dataset_says_itself_which_views_to_train_on_and_how_space_is_laid_out(llff_scene):
+    config = FewShotDataManagerConfig(data=llff_scene, dataparser=OwnDataParserConfig())
+    manager = config.setup(device="cpu", test_mode="inference")
+    assert [path.name for path in manager.train_dataset.image_filenames] == ["image007.png", "image002.png"]
+    assert scene_info(manager.train_dataparser_outputs).view_ids == (7, 2)
+    assert not decide(manager.scene, EffectSettings()).on("ndc")
+
+
+def test_photos_and_rays_are_loaded_once_it_is_decided_what_is_simulated(llff_scene):
+    config = FewShotDataManagerConfig(data=llff_scene, dataparser=LLFFDataParserConfig())
+    manager = config.setup(device="cpu", test_mode="val")
+    assert not hasattr(manager, "pixels")
+    manager.set_effects(decided("ndc"))
+    assert manager.pixels.colors.shape == (3 * 24 * 32, 3) and manager.matched is None

@@ -5,8 +5,8 @@ import pytest
 from photo_sets import AHEAD, ASIDE, AWAY, TURNED, photo
 from PIL import Image, ImageFilter
 
-from sparsestyle_ns.data.features import find_features
-from sparsestyle_ns.prepare.diagnosis import MAX_FEATURES, Pair, check_photos, compare, linked_groups, shrink
+from sparsestyle_ns.data.features import find_features, linked_groups
+from sparsestyle_ns.prepare.diagnosis import MAX_FEATURES, check_photos, compare, shrink
 
 NAMES = ["a.jpg", "b.jpg", "c.jpg"]
 
@@ -75,5 +75,4 @@ def test_large_photos_are_compared_reduced():
     ("links", "groups"), [([], 4), ([(0, 1), (2, 3)], 2), ([(0, 1), (2, 3), (1, 2)], 1), ([(0, 1), (1, 2)], 2)]
 )
 def test_photos_are_linked_by_way_of_others(links, groups):
-    pairs = {(i, j): Pair(100, 100 if (i, j) in links else 0, 0.0, None) for i in range(4) for j in range(i + 1, 4)}
-    assert len(linked_groups(pairs, 4)) == groups
+    assert len(linked_groups(4, links)) == groups

@@ -60,7 +60,6 @@ def test_longer_sides_are_scaled_to_the_shortest_and_the_rest_is_cropped_about_t
     assert [framing.scaled for framing in (large, portrait, small)] == [(200, 150), (150, 200), (200, 150)]
     assert {framing.size for framing in (large, portrait, small)} == {(150, 150)}
     assert (large.corner, portrait.corner, small.corner) == ((25, 0), (0, 25), (25, 0))
-    assert large.scale == (0.5, 0.5)
 
 
 def test_a_cropped_photo_shows_its_middle():

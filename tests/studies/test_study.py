@@ -2,9 +2,8 @@
 
 import pytest
 
-from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.method_configs import method_config
-from sparsestyle_ns.studies.study import flag_of, get_setting, parse_dataparser, with_setting
+from sparsestyle_ns.studies.study import flag_of, get_setting, with_setting
 
 
 def test_a_setting_is_named_as_ns_train_names_it_and_changed_in_a_copy():
@@ -22,9 +21,3 @@ def test_settings_in_dictionaries_and_in_frozen_parts_have_places_too():
         before = get_setting(config, place)
         assert get_setting(with_setting(config, place, value), place) == value
         assert get_setting(config, place) == before != value
-
-
-def test_the_dataparser_is_known_from_the_files_or_named_with_its_options(llff_scene):
-    assert isinstance(parse_dataparser((), llff_scene), LLFFDataParserConfig)
-    named = parse_dataparser(("llff-data", "--eval-interval", "4"), llff_scene)
-    assert named.eval_interval == 4

@@ -7,8 +7,8 @@ import threading
 import pytest
 from nerfstudio.engine.trainer import Trainer
 from rich.console import Console
-
 from sparsestyle_ns.engine.coarse_trainer import CoarseFewShotTrainer
+
 from sparsestyle_ns.engine.previews import preview_steps
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.utils import progress

@@ -13,7 +13,7 @@ import torch
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.viewer.viewer import Viewer
 
-from sparsestyle_ns.runs.run_folder import load_run
+from sparsestyle_ns.engine.loading import load_run
 
 run, painting = Path(sys.argv[1]), sys.argv[2]
 torch.set_num_threads(2)

@@ -27,11 +27,11 @@ from PIL import Image
 
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
-from sparsestyle_ns.engine.training import Training
-from sparsestyle_ns.engine.training_step import warm_start
+from sparsestyle_ns.engine.training import Training, warm_start
 from sparsestyle_ns.export.stylised_scene import load_scene
 from sparsestyle_ns.gallery.make_gallery import collect_run
 from sparsestyle_ns.losses.stylization import Losses
+from sparsestyle_ns.pipelines.scene_views import cameras_between
 from sparsestyle_ns.rendering.baked_cache import MOST_BAKED
 from sparsestyle_ns.runs.run_folder import find_config
 from sparsestyle_ns.style.painting import Painting
@@ -252,7 +252,7 @@ def test_an_error_in_the_middle_leaves_the_style_on_the_screen(
     def fail(*_: object) -> None:
         raise RuntimeError("out of memory")
 
-    monkeypatch.setattr(panel.pipeline, "step", fail)
+    monkeypatch.setattr(panel.pipeline, "losses", fail)
     panel.restyling.restyle_upload("a.png", png(1))
     assert "RuntimeError: out of memory" in wait_for(panel)
     assert len(panel.styles) == 1 and drawn(panel).isfinite().all()
@@ -455,10 +455,10 @@ def test_restyling_takes_the_trainers_steps(runs: SimpleNamespace, painting: Pat
 
     workshop = Workshop(pipeline, runs.style, threading.Lock())
     workshop.new_field = lambda: fresh
-    frozen = [view.frozen for view in pipeline.scene_views]
+    frozen = [view.frozen for view in pipeline.scene_views.views]
     restyling = Restyling(workshop, Painting.read(painting), iterations=3)
     steps = list(restyling)
-    assert [view.frozen for view in pipeline.scene_views] == frozen  # shared, not made again
+    assert [view.frozen for view in pipeline.scene_views.views] == frozen  # shared, not made again
     assert steps[-1].done == 1.0 and steps[-1].seconds_left == 0.0
     for name, value in pipeline.model.residual.state_dict().items():
         assert torch.equal(restyling.field.state_dict()[name], value), name
@@ -469,12 +469,12 @@ def test_a_restyling_sees_exact_views_between_the_photos_also_of_a_run_that_is_s
 ) -> None:
     pipeline = panel.pipeline
     monkeypatch.setattr(pipeline.config, "novel_views", 1)
-    camera = pipeline._novel_cameras()[0]
+    (camera,) = cameras_between(pipeline.datamanager.train_dataset.cameras, 1)
     with torch.no_grad():
         exact = pipeline.model.get_outputs_for_camera(camera)["rgb_coarse"]
         with pipeline.model.rendering("baked"):
             assert not torch.equal(pipeline.model.get_outputs_for_camera(camera)["rgb_coarse"], exact)
-            assert torch.equal(pipeline._freeze_views()[-1].picture, exact)
+            assert torch.equal(pipeline.freeze_views().views[-1].picture, exact)
 
 
 def test_random_numbers_of_training_go_on_as_if_there_were_no_restyling(panel: StylePanel) -> None:
