@@ -10,11 +10,11 @@ import pytest
 from conftest import TINY
 
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.engine.previews import preview_steps
+from sparsestyle_ns.engine.previews import preview_path, preview_steps
 from sparsestyle_ns.studies import runs as runs_module
 from sparsestyle_ns.studies import training_process
 from sparsestyle_ns.studies.paper_runs import PaperRuns
-from sparsestyle_ns.studies.runs import SECONDS_FILE, Run, RunQueue, picture_after
+from sparsestyle_ns.studies.runs import SECONDS_FILE, Run, RunQueue
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress_file import PROGRESS_FILE, ProgressReport
@@ -250,5 +250,5 @@ def test_a_run_is_one_of_ns_train_in_a_process_of_its_own(llff_scene: Path, tmp_
     assert run.is_finished
     assert json.loads((run.folder / "scene.json").read_text())["view_ids"] == [1, 11]
     assert (run.folder / "config.yml").is_file()
-    assert picture_after(run.folder, 1).is_file() and picture_after(run.folder, 2).is_file()
+    assert preview_path(run.folder, 1).is_file() and preview_path(run.folder, 2).is_file()
     assert said[-1].startswith(f"{run.folder.name}: 2 iterations in")
