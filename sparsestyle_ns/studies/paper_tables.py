@@ -13,7 +13,6 @@ from sparsestyle_ns.evaluation.tables import COARSE_QUALITY, STYLE_AND_CONTENT, 
 from sparsestyle_ns.metrics.art_fid import why_left_out
 from sparsestyle_ns.runs.scene_record import SceneRecord
 from sparsestyle_ns.studies.baselines import can_transfer, smooth_along_flow, transfer_frames
-from sparsestyle_ns.studies.page import Captioned, Plot, Section
 from sparsestyle_ns.studies.paper_runs import PICTURES, PaperRuns
 from sparsestyle_ns.studies.plots import line_plot
 from sparsestyle_ns.studies.run_figures import (
@@ -25,7 +24,8 @@ from sparsestyle_ns.studies.run_figures import (
     measure_frames,
     measure_run,
 )
-from sparsestyle_ns.studies.runs import Run
+from sparsestyle_ns.studies.run_queue import Run
+from sparsestyle_ns.studies.study_page import Captioned, Plot, Section
 
 PAPER_ROWS: Dict[str, Tuple[float, ...]] = {
     "AdaIN": (0.189, 0.618, 0.276, 0.231, 0.601, 0.295),

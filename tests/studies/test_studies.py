@@ -18,8 +18,6 @@ from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.engine.previews import preview_path
 from sparsestyle_ns.studies import paper_tables, run_figures
-from sparsestyle_ns.studies.options import StudyOptions
-from sparsestyle_ns.studies.page import study_page
 from sparsestyle_ns.studies.paper_runs import COARSE_KINDS, STYLE_KINDS, PaperRuns
 from sparsestyle_ns.studies.paper_tables import (
     OF_METHODS,
@@ -33,8 +31,10 @@ from sparsestyle_ns.studies.paper_tables import (
     study_sections,
 )
 from sparsestyle_ns.studies.run_figures import PaintingMeasure, measure_run
-from sparsestyle_ns.studies.runs import Run, RunQueue
+from sparsestyle_ns.studies.run_queue import Run, RunQueue
 from sparsestyle_ns.studies.study import Study
+from sparsestyle_ns.studies.study_options import StudyOptions
+from sparsestyle_ns.studies.study_page import study_page
 from sparsestyle_ns.style.backbones import BACKBONES
 
 
