@@ -5,7 +5,6 @@ from typing import FrozenSet, Sequence
 
 import torch
 from jaxtyping import Float
-from nerfstudio.utils.writer import to8b
 from PIL import Image
 from torch import Tensor
 
@@ -57,7 +56,7 @@ def preview_path(run: Path, iterations: int) -> Path:
 
 def save_preview(picture: Float[Tensor, "H W 3"], run: Path, iterations: int) -> None:
     """Writes a preview into the folder previews of a run; where that can't be done, says so."""
-    image = Image.fromarray(to8b(picture).cpu().numpy())
+    image = Image.fromarray((picture.clamp(0.0, 1.0) * 255.0).byte().cpu().numpy())
     try:
         write_whole(preview_path(run, iterations), lambda file: image.save(file, "PNG"))
     except OSError as error:

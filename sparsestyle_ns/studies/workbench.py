@@ -176,7 +176,7 @@ class Workbench:
         """Training with a method's config, its schedules as they are there.
 
         Raises:
-            OutOfTimeError: the time was over before all views of stage 2 were frozen.
+            OutOfTimeError: the time is over, before the views of stage 2 are frozen.
         """
         torch.manual_seed(seed)
         config = copy.deepcopy(config)
