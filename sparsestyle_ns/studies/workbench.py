@@ -24,7 +24,7 @@ from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
-from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig, StyleInputs
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig
 from sparsestyle_ns.pipelines.scene_views import SceneViews
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
 from sparsestyle_ns.runs.scene_record import record_scene
@@ -164,8 +164,7 @@ class Workbench:
         """The painting's features with a run's settings, worked out once."""
         key = config.feature_side, config.style_side, config.style_features
         if key not in self._targets:
-            painting, backbone = config.load_style()
-            self._targets[key] = config.targets_of(StyleInputs(painting, backbone.to(self.device)))
+            self._targets[key] = config.targets_of(config.load_style(), self.device)
         return self._targets[key]
 
     def _setup_pipeline(self, config: SparseStyleTrainerConfig) -> CheckedPipeline:
