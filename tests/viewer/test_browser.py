@@ -222,6 +222,7 @@ def test_a_camera_path_made_in_the_viewer_renders(
     for _ in range(2):
         page.click("Add Keyframe")
         time.sleep(1.0)
+    page.wait_for("parseFloat(near('Duration (sec)', 'input').value) > 0")  # two keyframes have come
     page.click("Generate Command")
     page.wait_for("document.body.innerText.includes('ns-render camera-path')")
     words = page.tab.evaluate("document.body.innerText.match(/ns-render camera-path.*/)[0]")
