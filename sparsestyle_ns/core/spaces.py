@@ -65,7 +65,7 @@ class LinearSegments(Segments):
 
 
 @dataclass
-class ForwardFacingSegments(LinearSegments):
+class _ForwardFacingSegments(LinearSegments):
     """Linear segments in NDC, with the world rays they came from; t' runs from `first` to `last`."""
 
     origins: Float[Tensor, "rays 3"]
@@ -75,19 +75,17 @@ class ForwardFacingSegments(LinearSegments):
     last: Float[Tensor, "rays 1"]
 
     def distance(self, s: Tensor) -> Tensor:
-        """See `Segments.distance`."""
         t_ndc = self.first + s * (self.last - self.first)
         distance = ndc_distance(t_ndc, self.origins, self.directions, self.near, MAX_DISTANCE * self.near)
         return distance.clamp(min=0.0)  # a ray may start at its own origin, but for rounding
 
     def at_distance(self, distance: Tensor) -> Tensor:
-        """See `Segments.at_distance`."""
         t_ndc = ndc_parameter(distance, self.origins, self.directions, self.near)
         return _position_between(t_ndc, self.first, self.last)
 
 
 @dataclass
-class BoxSegments(LinearSegments):
+class _BoxSegments(LinearSegments):
     """Linear segments in a box, entered at distance `near` and left at `far`; `beyond` is behind all of the box."""
 
     near: Float[Tensor, "rays 1"]
@@ -99,7 +97,6 @@ class BoxSegments(LinearSegments):
         return torch.where(self.hit[:, None], self.near + s * (self.far - self.near), self.beyond)
 
     def at_distance(self, distance: Tensor) -> Tensor:
-        """See `Segments.at_distance`."""
         return _position_between(distance, self.near, self.far)
 
 
@@ -240,7 +237,7 @@ class ForwardFacingSpace(Space):
         self.focal_over_half_size = focal_over_half_size
         self.near = near
 
-    def segments(self, origins: Tensor, directions: Tensor) -> ForwardFacingSegments:
+    def segments(self, origins: Tensor, directions: Tensor) -> _ForwardFacingSegments:
         """See `Space.segments`."""
         start, extent, valid = ndc_rays(origins, directions, self.focal_over_half_size, self.near)
         # A camera that has flown past the nearest thing doesn't see what is behind it, and past the farthest, nothing.
@@ -249,7 +246,7 @@ class ForwardFacingSpace(Space):
         hit = (valid & (first < last)).squeeze(-1)
         size = self.maximum - self.minimum
         scale = 2.0 / torch.where(size > 0, size, 2.0)
-        return ForwardFacingSegments(
+        return _ForwardFacingSegments(
             start=(start + first * extent - self.minimum) * scale - 1.0,
             extent=(last - first) * extent * scale * hit[:, None],
             hit=hit,
@@ -275,13 +272,13 @@ class BoxSpace(Space):
         self.register_buffer("maximum", box.aabb[1].float().clone())
         self.near = near
 
-    def segments(self, origins: Tensor, directions: Tensor) -> BoxSegments:
+    def segments(self, origins: Tensor, directions: Tensor) -> _BoxSegments:
         """See `Space.segments`."""
         center = 0.5 * (self.minimum + self.maximum)
         size = self.maximum - self.minimum
         scale = 2.0 / size.amax()
         near, far, hit = intersect_box(origins, directions, self.minimum, self.maximum, self.near / scale)
-        return BoxSegments(
+        return _BoxSegments(
             start=(origins + near * directions - center) * scale,
             extent=(far - near) * directions * scale,
             hit=hit,

@@ -80,7 +80,9 @@ def _decode(data: bytes, name: Union[str, Path]) -> Float[Tensor, "3 H W"]:
         with Image.open(io.BytesIO(data)) as image:
             # Pillow can say what is wrong with a damaged file; OpenCV only that there is no image.
             image.load()
-            pixels = _decode_deep_png(data) if _is_deep_png(data) else _decode_with_pillow(image)
+            # Of 16 bits a channel in a PNG, whose header has the depth at byte 24, Pillow would keep 8.
+            is_deep = data.startswith(b"\x89PNG\r\n\x1a\n") and data[24] == 16
+            pixels = _decode_deep_png(data) if is_deep else _decode_with_pillow(image)
             pixels = _turn_upright(_lay_over_white(pixels), image.getexif().get(ExifTags.Base.Orientation, 1))
     except UnidentifiedImageError as error:
         raise InputError(
@@ -99,20 +101,12 @@ def _decode(data: bytes, name: Union[str, Path]) -> Float[Tensor, "3 H W"]:
     return torch.from_numpy(pixels).permute(2, 0, 1).contiguous().clamp(0, 1)
 
 
-def _is_deep_png(data: bytes) -> bool:
-    """Whether this is a PNG of 16 bits a channel, of which Pillow would keep 8; the header has the depth at byte 24."""
-    return data.startswith(b"\x89PNG\r\n\x1a\n") and data[24] == 16
-
-
-TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
-"""OpenCV's conversion for a picture of so many channels."""
-
-
 def _decode_deep_png(data: bytes) -> Float[np.ndarray, "H W channels"]:
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ValueError("its 16-bit PNG data cannot be decoded")
-    return _to_unit_range(cv2.cvtColor(pixels, TO_RGB[1 if pixels.ndim == 2 else pixels.shape[2]]))
+    to_rgb = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
+    return _to_unit_range(cv2.cvtColor(pixels, to_rgb[1 if pixels.ndim == 2 else pixels.shape[2]]))
 
 
 def _decode_with_pillow(image: Image.Image) -> Float[np.ndarray, "H W channels"]:

@@ -17,8 +17,8 @@ def write_whole(
 ) -> Path:
     """Writes a file that gets its name only when it is whole and on the disk; returns its path.
 
-    A process that is killed meanwhile leaves the former file as it was, and the unfinished one under another name,
-    which the next call overwrites. Folders on the way to it are made.
+    A failure leaves the former file as it was, and a process that is killed meanwhile also the unfinished one under
+    another name, which the next call overwrites. Folders on the way to it are made.
 
     Args:
         content: text, which is written in UTF-8, bytes, or a function that writes them into an open file.
@@ -29,14 +29,17 @@ def write_whole(
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     unfinished = temporary or target.with_name(target.name + ".unfinished")
-    with open(unfinished, "wb") as file:
-        if callable(content):
-            content(file)
-        else:
-            file.write(content.encode("utf-8") if isinstance(content, str) else content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(unfinished, target)
+    try:
+        with open(unfinished, "wb") as file:
+            if callable(content):
+                content(file)
+            else:
+                file.write(content.encode("utf-8") if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(unfinished, target)
+    finally:
+        unfinished.unlink(missing_ok=True)
     folder = os.open(target.parent, os.O_RDONLY)  # the new name is on the disk once its folder is
     try:
         os.fsync(folder)
@@ -68,13 +71,10 @@ def prepare_output(output_path: Path, what: str, example: str) -> None:
 def write_output(output_path: Path, content: bytes, what: str, example: str) -> Path:
     """Writes a file as `write_whole` does, and returns its absolute path; arguments and errors of `prepare_output`."""
     prepare_output(output_path, what, example)
-    unfinished = output_path.with_name(output_path.name + ".unfinished")
     try:
-        return write_whole(output_path, content, unfinished).resolve()
+        return write_whole(output_path, content).resolve()
     except OSError as error:
         raise _not_writable(output_path, what, error) from error
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 def _not_writable(output_path: Path, what: str, error: OSError) -> InputError:
