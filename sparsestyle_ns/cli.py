@@ -12,7 +12,7 @@ import tyro
 
 from sparsestyle_ns.export.export_options import ExportOptions
 from sparsestyle_ns.gallery.gallery_options import GalleryOptions
-from sparsestyle_ns.studies.options import StudyOptions, TradeoffOptions
+from sparsestyle_ns.studies.study_options import StudyOptions, TradeoffOptions
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 
 

@@ -44,7 +44,6 @@ def ndc_rays(
     (o_z < -n) starts behind its origin; `ndc_distance` is negative on that first stretch.
 
     Args:
-        origins, directions: o and d, in the world; d of any length.
         focal_over_half_size: (2f/w, 2f/h), the focal length over half the image's width and height.
         near: n, the near plane's distance from z = 0 in world units, above 0.
 
@@ -73,14 +72,9 @@ def ndc_distance(
     The point's depth is z = -n / (1 - t') (NeRF, appendix C), and the distance (z - o_z) / d_z is measured from the
     ray's own origin, before its move to the near plane, in units of the direction's length.
 
-    Args:
-        t_ndc: t', 0 on the near plane and 1 at infinity.
-        origins, directions, near: o, d and n, as given to `ndc_rays`. Shapes are broadcast against each other.
-        max_distance: cap of the result. It is the result where t' >= 1, and no gradient flows there.
-
-    Returns:
-        The distance; negative where the point lies behind the origin. A ray that never reaches the near plane gets the
-        distance along the ray straight ahead that stands in for it.
+    It is negative where the point lies behind the origin, and at most `max_distance`, which is the result, without a
+    gradient, where t' >= 1. A ray that never reaches the near plane gets the distance along the ray straight ahead that
+    stands in for it. Shapes are broadcast against each other.
     """
     _, forward_z, _ = _forward(directions)
     infinite = t_ndc >= 1
@@ -97,12 +91,7 @@ def ndc_parameter(
 ) -> Float[Tensor, "*batch 1"]:
     """t' of the point at a distance along a world ray: the inverse of `ndc_distance`, t' = 1 + n/z.
 
-    Args:
-        distance: from the ray's own origin, in units of the direction's length.
-        origins, directions, near: as given to `ndc_distance`.
-
-    Returns:
-        t', below 0 before the near plane and at most 1. A point on or behind the camera plane counts as just before it.
+    It is below 0 before the near plane and at most 1. A point on or behind the camera plane counts as just before it.
     """
     _, forward_z, _ = _forward(directions)
     z = origins[..., 2:] + distance * forward_z

@@ -79,7 +79,7 @@ class DensityGrid(nn.Module):
 
         Args:
             even_share: part of the mass in (0, 1] that is spread evenly.
-            generator: source of random numbers, or None for a fixed placement.
+            generator: moves borders at random; None gives a fixed placement.
         """
         rays = len(segments.hit)
         edges = even_edges(rays, num_bins, self.density.device, generator)
@@ -112,9 +112,7 @@ class Occupancy(nn.Module):
     ) -> None:
         """Marks the cells in which a ray would meet an opacity of at least `min_alpha`, and their neighbours.
 
-        Args:
-            min_alpha: smallest 1 − exp(−σ · cell side), at the cell's centre, that counts.
-            chunk: points a call of `density`.
+        Opacity is 1 − exp(−σ · cell side) at the cell's centre; `density` gives σ of at most `chunk` points at once.
         """
         side = 2.0 / self.resolution
         axis = (torch.arange(self.resolution, device=self.occupied.device) + 0.5) * side - 1.0

@@ -16,9 +16,7 @@ def even_edges(
 ) -> Float[Tensor, "rays edges"]:
     """`num_samples` + 1 ascending borders in [0, 1] on each ray.
 
-    Args:
-        generator: source of random numbers; each inner border is moved by up to half a step (stratified sampling).
-            None gives even borders.
+    Even ones, or with a generator moved by up to half a step each, but for the first and last (stratified sampling).
     """
     if generator is None:
         return torch.linspace(0.0, 1.0, num_samples + 1, device=device).expand(num_rays, -1)
@@ -41,7 +39,7 @@ def sample_pdf(
     Args:
         edges: ascending borders of the histogram's bins.
         weights: mass of each bin, ≥ 0, with a positive sum on every ray.
-        generator: source of random numbers; moves inner borders by up to half a part of mass. None gives none.
+        generator: moves inner borders by up to half a part of mass.
     """
     mass = torch.cumsum(weights, dim=-1)
     cdf = torch.cat([torch.zeros_like(mass[:, :1]), mass / mass[:, -1:]], dim=-1)

@@ -133,11 +133,8 @@ def distortion(weights: Float[Tensor, "*rays samples"], edges: Float[Tensor, "*r
 
     It is small when the weight lies in one place. Between two neighbouring middles passes each pair of weights of which
     one is on either side: Σ_ij w_i w_j |m_i − m_j| = 2 Σ_k (m_{k+1} − m_k) (Σ_{i≤k} w_i) (Σ_{i>k} w_i). That takes
-    linear time, and no term of it is negative, so that none of them cancel.
-
-    Args:
-        weights: w ≥ 0.
-        edges: s, the samples' ascending borders, one more than samples; normalised to [0, 1] by the caller.
+    linear time, and no term of it is negative, so that none of them cancel. Edges are the samples' ascending borders s,
+    normalised to [0, 1] by the caller.
     """
     mass = torch.cumsum(weights, dim=-1)
     before, behind = mass[..., :-1], mass[..., -1:] - mass[..., :-1]

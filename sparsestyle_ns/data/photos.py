@@ -52,16 +52,10 @@ def open_photo(path: Path, draft: bool = False) -> Image.Image:
     except Exception as error:
         raise InputError(f"{path} cannot be read as an image, it may be cut short: replace it.") from error
     if image.mode not in IMAGE_MODES:
-        raise InputError(
-            f"{path} has pixels of the kind {image.mode}{_count_broken(image)}: save it as 8-bit RGB or RGBA."
-        )
+        broken = int((~np.isfinite(np.asarray(image))).sum()) if image.mode == "F" else 0
+        also = f", {broken} of which are not finite" * (broken > 0)
+        raise InputError(f"{path} has pixels of the kind {image.mode}{also}: save it as 8-bit RGB or RGBA.")
     return image
-
-
-def _count_broken(image: Image.Image) -> str:
-    """What to add about pixels that aren't finite, which only floating-point images can have."""
-    count = int((~np.isfinite(np.asarray(image))).sum()) if image.mode == "F" else 0
-    return f", {count} of which are not finite" * (count > 0)
 
 
 def photo_size(path: Path) -> Tuple[int, int]:

@@ -1,7 +1,7 @@
 """Reading a scene with any dataparser, with errors that name what is wrong; nerfstudio's own check next to nothing."""
 
-from dataclasses import dataclass, replace
-from typing import Callable, Dict, Optional, Tuple, Type
+from dataclasses import replace
+from typing import Callable, Dict, NamedTuple, Optional, Tuple, Type
 
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
@@ -28,17 +28,13 @@ def check_nerfstudio_files(config: NerfstudioDataParserConfig, split: str) -> No
     read_transforms(config.data if is_file else config.data / "transforms.json", with_angle=False)
 
 
-@dataclass(frozen=True)
-class Adapter:
-    """What one of nerfstudio's dataparsers lacks.
-
-    Attributes:
-        check_files: looks at the files of a split before they are read; raises an `InputError`.
-        standard_views: see `SceneInfo`.
-    """
+class Adapter(NamedTuple):
+    """What one of nerfstudio's dataparsers lacks."""
 
     check_files: Callable[[DataParserConfig, str], None]
+    """Looks at the files of a split before they are read; raises an `InputError`."""
     standard_views: Optional[Tuple[int, ...]] = None
+    """See `SceneInfo`."""
 
 
 ADAPTERS: Dict[Type[DataParserConfig], Adapter] = {

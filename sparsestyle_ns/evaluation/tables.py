@@ -1,4 +1,4 @@
-"""Figures set out in tables, on a terminal and for a page."""
+"""Figures set out in tables, for a terminal and for pages."""
 
 from dataclasses import dataclass, field
 from typing import Dict, List, Optional, Sequence, Tuple

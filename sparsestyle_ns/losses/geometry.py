@@ -9,10 +9,7 @@ def near_density(
 ) -> Float[Tensor, ""]:
     """Mean density of the samples that begin within `reach` of the ray's start (FreeNeRF's occlusion loss, Eq. 4).
 
-    Args:
-        density: σ of each sample.
-        edges: the samples' borders, in [0, 1].
-        reach: part of the ray that counts as near the camera, in (0, 1].
+    Edges are the samples' borders, in [0, 1]; `reach` is the part of the ray that counts as near the camera, in (0, 1].
     """
     return (density * (edges[:, :-1] < reach)).mean()
 
@@ -24,12 +21,7 @@ def matched_depth_loss(
 
     s_i are the middles of the samples. Light that goes on counts as farthest away, at distance 1. The absolute value
     keeps a wrong match from outweighing right ones. One at an end of its segment lies outside of the scene and is
-    wrong: it doesn't count.
-
-    Args:
-        weights: of the samples, not negative, at most 1 in sum.
-        edges: the samples' borders, in [0, 1].
-        s: where the points are, in [0, 1].
+    wrong: it doesn't count. Weights aren't negative, and at most 1 in sum; borders and points lie in [0, 1].
     """
     middles = 0.5 * (edges[:, 1:] + edges[:, :-1])
     missed = (weights * (middles - s).abs()).sum(dim=-1) + 1.0 - weights.sum(dim=-1)

@@ -67,13 +67,10 @@ def nnfm_loss(
     is constant almost everywhere, and the style gets no gradient.
 
     Args:
-        features: what the rendered view gives, one vector a pixel of its feature map, of lengths up to 1e18. A vector
-            of length zero, or no more than `SHORTEST`, has no direction: it counts as cosine 0 and gets a gradient of
-            zero.
-        style_features: what the style image gives, one vector a row, or the index of it: make one where the same
-            style is used more than once or twice.
-        neighbors: the rows of `style_features` that `nearest_neighbors` gave, where they are known; searched otherwise.
-        chunk_size: see `nearest_neighbors`.
+        features: what the rendered view gives, one vector a row, of lengths up to 1e18. One of length zero, or no more
+            than `SHORTEST`, has no direction: it counts as cosine 0 and gets a gradient of zero.
+        style_features: what the style image gives, or an index of it, where it is used more than once or twice.
+        neighbors: what `nearest_neighbors` gave, where it is known; searched otherwise.
 
     Returns:
         A scalar in [0, 2]; in [0, 1] for features that are never negative, such as those after a ReLU.

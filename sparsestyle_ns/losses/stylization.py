@@ -122,13 +122,10 @@ class StyleTargets:
         content: Float[Tensor, "1 C h w"],
         accumulation: Optional[Float[Tensor, "H W"]] = None,
     ) -> StylizedView:
-        """A rendered picture, ready for the losses.
+        """A rendered picture in [0, 1], and the features of the one that it must stay like, ready for the losses.
 
-        Args:
-            image: the picture, in [0, 1].
-            content: features of the picture that it must stay like.
-            accumulation: how opaque the scene is in each pixel. Where it is less than half, the picture shows a
-                background that nothing can stylise, and its features don't count. None: all count.
+        Where the scene's opacity, the accumulation, is less than half, the picture shows a background that nothing can
+        stylise, and its features don't count. None: all count.
         """
         features, target = (covered_rows(maps, accumulation) for maps in (self.features(image), content))
         return StylizedView(image, features, target)

@@ -40,13 +40,8 @@ def frechet_distance(first: Float[Tensor, "n C"], second: Float[Tensor, "m C"]) 
 
     With X and X' the centred samples over √(n − 1) and √(m − 1), Σ = XᵀX and Σ' = X'ᵀX', the eigenvalues of Σ Σ' other
     than 0 are those of (X X'ᵀ)(X X'ᵀ)ᵀ. So the last trace is the sum of the singular values of X X'ᵀ, a matrix of n × m
-    numbers, however singular the covariances are. A sample of one has the covariance 0.
-
-    Args:
-        first, second: one vector a row, one or more each.
-
-    Returns:
-        0 or more, in units of the features squared; 0 for samples of equal mean and covariance.
+    numbers, however singular the covariances are. A sample of one has the covariance 0. The result, in
+    units of the features squared, is 0 where mean and covariance are equal, else more.
     """
     samples = [sample.double() for sample in (first, second)]
     means = [sample.mean(dim=0) for sample in samples]
@@ -130,11 +125,7 @@ class ArtFID:
 
     @classmethod
     def against(cls, painting: Float[Tensor, "3 H W"]) -> Optional["ArtFID"]:
-        """With the weights in the torch hub cache; None where some are missing.
-
-        Raises:
-            InputError: the file of the Inception-v3 is another network's.
-        """
+        """With the weights in the torch hub cache; None where some are missing. Raises as `load_art_inception` does."""
         return None if missing_weights() else cls(load_art_inception(hub_file(ART_INCEPTION_FILE)), painting)
 
     @torch.no_grad()

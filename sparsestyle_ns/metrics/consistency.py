@@ -54,10 +54,7 @@ def masked_ssim(
 
 
 def masked_distance(
-    metric: Metric,
-    first: Float[Tensor, "H W 3"],
-    second: Float[Tensor, "H W 3"],
-    visible: Bool[Tensor, "H W"],
+    metric: Metric, first: Float[Tensor, "H W 3"], second: Float[Tensor, "H W 3"], visible: Bool[Tensor, "H W"]
 ) -> float:
     """A perceptual distance of visible pixels, by a metric that is a mean over pixels, 0 where pictures are equal.
 
@@ -81,14 +78,11 @@ def pair_consistency(
     if not visible.any():
         return {}
     first, second = first.clamp(0.0, 1.0), second.clamp(0.0, 1.0)
-    warped = sample_picture(second, correspondence.pixels)
+    warped, metrics = sample_picture(second, correspondence.pixels), perceptual_metrics(first.shape[:2])
     return {
         "rmse": float(masked_rmse(first, warped, visible)),
         "ssim": float(masked_ssim(first, warped, visible)),
-        **{
-            name: masked_distance(metric, first, warped, visible)
-            for name, metric in perceptual_metrics(first.shape[:2]).items()
-        },
+        **{name: masked_distance(metric, first, warped, visible) for name, metric in metrics.items()},
     }
 
 
@@ -99,13 +93,10 @@ class PathGeometry:
     """
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
-        self.pairs = {
-            name: [
-                correspond(surfaces[t], surfaces[t + gap])
-                for t in track(range(len(surfaces) - gap), f"Matching frames, {name} range")
-            ]
-            for name, gap in RANGES.items()
-        }
+        self.pairs = {}
+        for name, gap in RANGES.items():
+            starts = track(range(len(surfaces) - gap), f"Matching frames, {name} range")
+            self.pairs[name] = [correspond(surfaces[t], surfaces[t + gap]) for t in starts]
 
     def visible_share(self, name: str) -> Optional[float]:
         """Share of pixels that count in a range's pairs; None where the path has no such pair."""

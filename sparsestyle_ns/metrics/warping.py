@@ -32,10 +32,8 @@ class Pinhole:
         x, y, z = ((points - self.camera_to_world[:, 3]) @ self.camera_to_world[:, :3]).unbind(dim=-1)
         in_front = z < 0
         depth = torch.where(in_front, -z, 1.0)
-        pixels = torch.stack(
-            [self.center[0] + self.focal[0] * x / depth, self.center[1] - self.focal[1] * y / depth], dim=-1
-        )
-        return torch.where(in_front[..., None], pixels, 0.0), in_front
+        columns, rows = self.center[0] + self.focal[0] * x / depth, self.center[1] - self.focal[1] * y / depth
+        return torch.where(in_front[..., None], torch.stack([columns, rows], dim=-1), 0.0), in_front
 
 
 @dataclass
@@ -64,19 +62,15 @@ def pixel_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "H W 2
 def sample_picture(picture: Float[Tensor, "H W C"], pixels: Float[Tensor, "h w 2"]) -> Float[Tensor, "h w C"]:
     """A picture read at pixel coordinates, bilinearly; beyond its outermost pixel centres as at the border."""
     height, width = picture.shape[:2]
-    grid = 2.0 * pixels / pixels.new_tensor([width, height]) - 1.0
-    read = F.grid_sample(
-        picture.permute(2, 0, 1)[None], grid[None], mode="bilinear", padding_mode="border", align_corners=False
-    )
+    grid, image = 2.0 * pixels / pixels.new_tensor([width, height]) - 1.0, picture.permute(2, 0, 1)
+    read = F.grid_sample(image[None], grid[None], mode="bilinear", padding_mode="border", align_corners=False)
     return read[0].permute(1, 2, 0)
 
 
 def is_occluded(forward: Float[Tensor, "*batch 2"], backward: Float[Tensor, "*batch 2"]) -> Bool[Tensor, "*batch"]:
     """Whether going there and back doesn't end where it began: |f + b|² > 0.01 (|f|² + |b|²) + 0.5 (Lai et al. 2018).
 
-    Args:
-        forward: flow of a pixel to the other view, in pixels.
-        backward: flow of the place that it leads to, back.
+    f is a pixel's flow to the other view, b that of the place it leads to, back; both in pixels.
     """
     error = (forward + backward).square().sum(dim=-1)
     size = forward.square().sum(dim=-1) + backward.square().sum(dim=-1)

@@ -36,8 +36,8 @@ from sparsestyle_ns.rendering.render import (
 )
 from sparsestyle_ns.rendering.visible_samples import Marching
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.numba_kernels import untraced
 from sparsestyle_ns.utils.progress import bar
-from sparsestyle_ns.utils.untraced import untraced
 
 RAYS_PER_CALL = 1 << 13
 """Rays that are marched at once; bounds the memory of the steps in empty space."""

@@ -3,9 +3,8 @@
 import json
 import math
 import os
-from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Optional, Sequence
+from typing import Any, Callable, Dict, List, Optional, Sequence, Union
 
 import numpy as np
 
@@ -25,54 +24,23 @@ SHARED = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_
 """Entries of all frames together that hold no longer once each frame has intrinsics of its own."""
 
 
-class Poses(ABC):
-    """Poses of a photo set. A subclass is one file format."""
-
-    path: Path
-    """The file that they are from."""
-    parser: str
-    """The dataparser that reads what `write` writes."""
-
-    @abstractmethod
-    def photos(self, found: Sequence[Path]) -> List[Path]:
-        """Those of the photos that have poses, in the poses' order.
-
-        Raises:
-            InputError: there are too few, or it isn't clear which pose is whose.
-        """
-
-    @abstractmethod
-    def size(self, index: int) -> Optional[Size]:
-        """Width and height of the photo that a pose was made for; None where the file doesn't say."""
-
-    @abstractmethod
-    def write(self, folder: Path, names: Sequence[str], framings: Sequence[Framing]) -> None:
-        """Writes the file for photos with new names and sizes into a folder that has them in `images`."""
-
-
-def find_poses(photos: Path) -> Optional[Poses]:
-    """The poses in the folder of the photos or, for a folder `images`, in the one around it; None if there are none.
-
-    Raises:
-        InputError: they can't be used.
-    """
-    for folder in (photos, photos.parent) if photos.name.startswith("images") else (photos,):
-        if (folder / POSES_BOUNDS).is_file():
-            return LLFFPoses(folder / POSES_BOUNDS)
-        if (folder / TRANSFORMS).is_file():
-            return TransformsPoses(folder / TRANSFORMS)
-    return None
-
-
 def fits(photo: Size, pose: Size) -> bool:
     """Whether a photo is a scaled version of what a pose is for."""
     return abs(photo[0] * pose[1] - photo[1] * pose[0]) < ASPECT_TOLERANCE * photo[1] * pose[0]
 
 
-class LLFFPoses(Poses):
-    """`poses_bounds.npy`: one row a photo, in the order of their names."""
+class LLFFPoses:
+    """Poses of a photo set in `poses_bounds.npy`: one row a photo, in the order of their names.
+
+    Args:
+        path: the file.
+
+    Raises:
+        InputError: it can't be used.
+    """
 
     parser = "llff-data"
+    """The dataparser that reads what `write` writes."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -80,7 +48,11 @@ class LLFFPoses(Poses):
         self.rows = np.load(path).astype(np.float64)
 
     def photos(self, found: Sequence[Path]) -> List[Path]:
-        """See `Poses.photos`."""
+        """Those of the photos that have poses, in the poses' order.
+
+        Raises:
+            InputError: there are too few, or it isn't clear which pose is whose.
+        """
         if len(found) != len(self.rows):
             raise InputError(
                 f"There are {len(found)} photos, but {self.path} has {len(self.rows)} poses; keep exactly one photo "
@@ -88,21 +60,21 @@ class LLFFPoses(Poses):
             )
         return list(found)
 
-    def size(self, index: int) -> Size:
-        """See `Poses.size`."""
+    def size(self, index: int) -> Optional[Size]:
+        """Width and height of the photo that a pose was made for; None where the file doesn't say."""
         height, width = self.rows[index, [4, 9]]
         return round(width), round(height)
 
     def write(self, folder: Path, names: Sequence[str], framings: Sequence[Framing]) -> None:
-        """See `Poses.write`."""
+        """Writes the file for photos with new names and sizes into a folder that has them in `images`."""
         rows = self.rows.copy()
         for row, framing in zip(rows, framings, strict=True):
             row[[9, 4, 14]] = *framing.size, row[14] * framing.scaled[0] / row[9]
         np.save(folder / POSES_BOUNDS, rows)
 
 
-class TransformsPoses(Poses):
-    """nerfstudio's `transforms.json`: a frame a photo, with intrinsics of its own or for all."""
+class TransformsPoses:
+    """The same in nerfstudio's `transforms.json`: a frame a photo, with intrinsics of its own or for all."""
 
     parser = "nerfstudio-data"
 
@@ -123,7 +95,7 @@ class TransformsPoses(Poses):
         self.used: List[Dict[str, Any]] = []
 
     def photos(self, found: Sequence[Path]) -> List[Path]:
-        """See `Poses.photos`; photos and frames without the other are left out."""
+        """See `LLFFPoses.photos`; photos and frames without the other are left out."""
         frames = self._frames_of(found)
         if len(frames) < MIN_PHOTOS:
             raise InputError(
@@ -186,7 +158,7 @@ class TransformsPoses(Poses):
         return {split: [renamed[path] for path in paths if path in renamed] for split, paths in listed.items()}
 
     def size(self, index: int) -> Optional[Size]:
-        """See `Poses.size`."""
+        """See `LLFFPoses.size`."""
         width, height = (self._value(index, key) for key in ("w", "h"))
         return None if width is None or height is None else (round(width), round(height))
 
@@ -194,7 +166,7 @@ class TransformsPoses(Poses):
         return self.used[index].get(key, self.content.get(key, default))
 
     def write(self, folder: Path, names: Sequence[str], framings: Sequence[Framing]) -> None:
-        """See `Poses.write`. Distortion is in units of the focal length, and stays as it is."""
+        """See `LLFFPoses.write`. Distortion is in units of the focal length, and stays as it is."""
         names = [f"images/{name}" for name in names]
         frames = []
         for index, (frame, name, framing) in enumerate(zip(self.used, names, framings, strict=True)):
@@ -218,3 +190,20 @@ class TransformsPoses(Poses):
             "w": framing.size[0],
             "h": framing.size[1],
         }
+
+
+Poses = Union[LLFFPoses, TransformsPoses]
+
+
+def find_poses(photos: Path) -> Optional[Poses]:
+    """The poses in the folder of the photos or, for a folder `images`, in the one around it; None if there are none.
+
+    Raises:
+        InputError: they can't be used.
+    """
+    for folder in (photos, photos.parent) if photos.name.startswith("images") else (photos,):
+        if (folder / POSES_BOUNDS).is_file():
+            return LLFFPoses(folder / POSES_BOUNDS)
+        if (folder / TRANSFORMS).is_file():
+            return TransformsPoses(folder / TRANSFORMS)
+    return None

@@ -37,20 +37,18 @@ def iterations_line(curve: Curve) -> str:
     """How many iterations are enough for a draft, how many gave the best result, and what more would cost."""
     draft, front = curve.recommended, curve.front
     assert draft is not None
-    best = front[-1]
-    parts = [f"for a draft {_result(curve, draft)}"]
-    if best is not draft:
-        parts.append(f"for the best result {_result(curve, best)}")
+    uses = {"for a draft": draft} if draft is front[-1] else {"for a draft": draft, "for the best result": front[-1]}
+    words = ", ".join(f"{point.setting} {use} ({_result(curve, point)})" for use, point in uses.items())
     factor = _last_factor(front) if curve.error == "psnr" else None
     if factor is not None:
-        parts.append(f"after that 1 dB more takes {times(factor)} the time")
-    return f"{curve.title} ({curve.flag}): {'; '.join(parts)}{_remarks(draft, best)}"
+        words += f"; after that 1 dB more takes {times(factor)} the time"
+    return f"{curve.title} ({curve.flag}): {words}{_remarks(draft, front[-1])}"
 
 
 def _result(curve: Curve, point: Point) -> str:
     value = point.median(curve.error)
     quality = f"{value:.1f} dB" if curve.error == "psnr" else f"style loss {value:.3f}"
-    return f"{point.setting} ({duration(point.median(curve.time))}, {quality})"
+    return f"{duration(point.median(curve.time))}, {quality}"
 
 
 def _last_factor(front: Sequence[Point]) -> Optional[float]:

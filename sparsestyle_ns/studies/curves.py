@@ -5,7 +5,6 @@ import statistics
 from dataclasses import dataclass, field
 from typing import Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple, Union
 
-from sparsestyle_ns.studies.options import Group
 from sparsestyle_ns.studies.pareto import (
     TIME_EXPONENT,
     decibels,
@@ -16,6 +15,7 @@ from sparsestyle_ns.studies.pareto import (
     pareto_front,
     root_mean_square,
 )
+from sparsestyle_ns.studies.study_options import Group
 
 Values = Mapping[str, Union[float, Sequence[float]]]
 """What one measurement found: a number, or several repetitions of it, for each metric."""

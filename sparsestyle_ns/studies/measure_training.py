@@ -5,8 +5,8 @@ from typing import Dict, List, NamedTuple, Sequence, Tuple
 
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.studies.curves import Curve, Values
-from sparsestyle_ns.studies.options import Group
 from sparsestyle_ns.studies.study import flag_of, get_setting, with_setting
+from sparsestyle_ns.studies.study_options import Group
 from sparsestyle_ns.studies.time_budget import Budget, Case, OutOfTimeError, Plan, in_turns
 from sparsestyle_ns.studies.workbench import Workbench, squeezed
 from sparsestyle_ns.utils.machine import PeakMemory

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Dict, Mapping, Optional, Tuple
 
-from sparsestyle_ns.studies.runs import Run, as_pairs
+from sparsestyle_ns.studies.run_queue import Run, as_pairs
 from sparsestyle_ns.studies.study import Stage, Study
 from sparsestyle_ns.style.backbones import available_backbone
 

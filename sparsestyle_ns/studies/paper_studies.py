@@ -6,12 +6,12 @@ from typing import Sequence
 
 from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.engine.hints import finish
-from sparsestyle_ns.studies.options import StudyOptions
-from sparsestyle_ns.studies.page import study_page
 from sparsestyle_ns.studies.paper_runs import PaperRuns
 from sparsestyle_ns.studies.paper_tables import OF_METHODS, Comparison, ablations, needed_runs, study_sections
-from sparsestyle_ns.studies.runs import RunQueue
+from sparsestyle_ns.studies.run_queue import RunQueue
 from sparsestyle_ns.studies.study import Study
+from sparsestyle_ns.studies.study_options import StudyOptions
+from sparsestyle_ns.studies.study_page import study_page
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.page import prepare_page, write_page

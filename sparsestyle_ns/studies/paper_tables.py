@@ -7,12 +7,12 @@ from typing import Dict, List, Mapping, Optional, Sequence, Tuple
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestyle_ns.engine.previews import preview_path
 from sparsestyle_ns.evaluation.path_frames import PathFrames
 from sparsestyle_ns.evaluation.tables import COARSE_QUALITY, STYLE_AND_CONTENT, Table, consistency_columns, table_of
 from sparsestyle_ns.metrics.art_fid import why_left_out
 from sparsestyle_ns.runs.scene_record import SceneRecord
 from sparsestyle_ns.studies.baselines import can_transfer, smooth_along_flow, transfer_frames
-from sparsestyle_ns.studies.page import Captioned, Plot, Section
 from sparsestyle_ns.studies.paper_runs import PICTURES, PaperRuns
 from sparsestyle_ns.studies.plots import line_plot
 from sparsestyle_ns.studies.run_figures import (
@@ -24,7 +24,8 @@ from sparsestyle_ns.studies.run_figures import (
     measure_frames,
     measure_run,
 )
-from sparsestyle_ns.studies.runs import Run, picture_after
+from sparsestyle_ns.studies.run_queue import Run
+from sparsestyle_ns.studies.study_page import Captioned, Plot, Section
 
 PAPER_ROWS: Dict[str, Tuple[float, ...]] = {
     "AdaIN": (0.189, 0.618, 0.276, 0.231, 0.601, 0.295),
@@ -227,7 +228,7 @@ def picture_grid(measured: Mapping[str, RunFigures]) -> List[Tuple[str, Captione
 def pictures_on_the_way(folder: Path, iterations: int) -> Captioned:
     """Pictures of a run while it was trained, as far as they are there."""
     captions = {**{count: f"after {count} iterations" for count in PICTURES}, iterations: "at the end"}
-    pictures = [(caption, picture_after(folder, count)) for count, caption in captions.items()]
+    pictures = [(caption, preview_path(folder, count)) for count, caption in captions.items()]
     return [(caption, path) for caption, path in pictures if path.is_file()]
 
 

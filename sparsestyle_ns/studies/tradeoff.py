@@ -17,8 +17,8 @@ from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.engine.hints import finish, scene_arguments
 from sparsestyle_ns.studies.measure_rendering import baking_plan, precision_plan, quadrature_plans
 from sparsestyle_ns.studies.measure_training import StageRuns
-from sparsestyle_ns.studies.options import TradeoffOptions
 from sparsestyle_ns.studies.study import Study
+from sparsestyle_ns.studies.study_options import TradeoffOptions
 from sparsestyle_ns.studies.time_budget import Budget, Plan, parse_duration, run_plans
 from sparsestyle_ns.studies.tradeoff_report import GROUPS, Fact, Report, cant_write
 from sparsestyle_ns.studies.workbench import Workbench

@@ -10,9 +10,9 @@ from typing import Dict, List, Mapping, Sequence, Union
 from sparsestyle_ns.evaluation.tables import Table
 from sparsestyle_ns.studies.advice import recommendation
 from sparsestyle_ns.studies.curves import METRICS, Curve, Point
-from sparsestyle_ns.studies.options import Group
-from sparsestyle_ns.studies.page import Section, study_page
 from sparsestyle_ns.studies.plots import curve_plot, overview
+from sparsestyle_ns.studies.study_options import Group
+from sparsestyle_ns.studies.study_page import Section, study_page
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 

@@ -38,8 +38,6 @@ T = TypeVar("T")
 
 HELD_OUT_VIEWS = 3
 """Held-out views that are measured at most; evenly spaced among all."""
-LOADING_SHARE = 0.05
-"""Part of all time that evaluating a coarse run may take before anything is measured; else one view stands for all."""
 PROBE_STEPS = 3
 """Iterations from which the time of one is estimated, after one that doesn't count."""
 
@@ -124,9 +122,7 @@ class Workbench:
         model = self._setup_pipeline(config).model
         model.load_state_dict(run.model_state())
         self.keep_coarse(model)
-        self.evaluate(model, self.views[:1])
-        if self.view_seconds[type(model)] * len(self.views) < LOADING_SHARE * self.budget.left:
-            self.evaluate(model, self.views)
+        self.evaluate(model, self.views)
 
     # ------------------------------------------------------------------------------------------------------- scene
 

@@ -20,11 +20,8 @@ def color_moments(
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
     """Mean and covariance of colours.
 
-    μ = Σ_i w_i c_i / Σ_i w_i and Σ = Σ_i w_i (c_i − μ)(c_i − μ)ᵀ / Σ_i w_i, computed and returned in float64.
-
-    Args:
-        colors: RGB in the last dimension, usually in [0, 1].
-        weights: how much each colour counts, 0 or more; all alike where left out.
+    μ = Σ_i w_i c_i / Σ_i w_i and Σ = Σ_i w_i (c_i − μ)(c_i − μ)ᵀ / Σ_i w_i, computed and returned in float64. Weights
+    are 0 or more; without them all colours count alike.
 
     Raises:
         InputError: there are no colours, or no weight is positive.
@@ -76,12 +73,7 @@ def palette_transform(
     1/σ; below, it falls in proportion to σ, from 1/`SMALLEST_SPREAD` to 0. The map is continuous in its arguments,
     its gain is bounded, and directions in which the content has no variance are mapped to the style's mean.
 
-    Args:
-        content_mean, content_covariance: μ_c and Σ_c, of colours in [0, 1].
-        style_mean, style_covariance: μ_s and Σ_s, of colours in [0, 1].
-
-    Returns:
-        A and b, in float64.
+    Colours are in [0, 1], A and b in float64.
     """
     variances, axes = torch.linalg.eigh(content_covariance.double())
     spreads = variances.clamp_min(0).sqrt()
@@ -96,10 +88,8 @@ def apply_palette(
 ) -> Float[Tensor, "*batch 3"]:
     """A c + b for every colour, in the colours' own dtype and on their device.
 
-    Args:
-        matrix, offset: A and b of `palette_transform`.
-        clamp: whether to cut the result to [0, 1]. Left as it is, it has the style's exact mean and covariance, but
-            may leave the range of colours a screen can show.
+    With A and b of `palette_transform` the result has the style's exact mean and covariance, but may leave the range of
+    colours that a screen can show; `clamp` cuts it to [0, 1].
     """
     transferred = colors @ matrix.to(colors).T + offset.to(colors)
     return transferred.clamp(0, 1) if clamp else transferred

@@ -82,6 +82,11 @@ class VGGBlock3(Backbone):
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
 
     @classmethod
+    def accepts(cls, state: Dict[str, Any]) -> bool:
+        """See `Backbone.accepts`."""
+        return any(str(key).rpartition(".")[0] in cls.stored.values() for key in state)
+
+    @classmethod
     def load(cls, weights: Weights, state: Dict[str, Any]) -> "VGGBlock3":
         """See `Backbone.load`."""
         network, trunk = cls(weights.describe(cls.name)), {}
@@ -138,11 +143,6 @@ class VGG16(VGGBlock3):
         """See `Backbone.why_absent`."""
         return f"torchvision's VGG-16 is not in {hub_file(VGG16_FILE).parent} and could not be downloaded"
 
-    @classmethod
-    def accepts(cls, state: Dict[str, Any]) -> bool:
-        """See `Backbone.accepts`."""
-        return not ShiftTolerantVGG16.accepts(state) and any(str(key).startswith("features.") for key in state)
-
 
 class ShiftTolerantVGG16(VGGBlock3):
     """The anti-aliased trunk inside the package stlpips-pytorch, of which only the weight file is read."""
@@ -171,11 +171,6 @@ class ShiftTolerantVGG16(VGGBlock3):
     def why_absent(cls) -> str:
         """See `Backbone.why_absent`."""
         return "the package stlpips-pytorch isn't installed"
-
-    @classmethod
-    def accepts(cls, state: Dict[str, Any]) -> bool:
-        """See `Backbone.accepts`."""
-        return any(str(key).startswith("net.slice") and str(key).endswith(".filt") for key in state)
 
 
 def _refuse_relatives(state: Dict[str, Any]) -> None:

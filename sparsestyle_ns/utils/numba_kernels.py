@@ -4,12 +4,17 @@ Numba's own thread pools can't be entered from two threads at once, as a viewer 
 compiled for one thread, and the work is shared out here.
 """
 
+import functools
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from typing import Callable, Sequence, Tuple
+from typing import Callable, ParamSpec, Sequence, Tuple, TypeVar
 
 import numba
 import torch
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def kernel(function: Callable[..., None]) -> Callable[..., None]:
@@ -45,3 +50,22 @@ def even_parts(length: int, count: int) -> Sequence[Tuple[int, int]]:
     """(start, end) of at most `count` runs of nearly the same length that together cover `length`; none is empty."""
     size = max(1, -(-length // count))
     return [(start, min(start + size, length)) for start in range(0, length, size)]
+
+
+def untraced(function: Callable[P, R]) -> Callable[P, R]:
+    """Has `function` run without the thread's trace function, which is back in place afterwards.
+
+    The viewer breaks a picture off by an exception that its trace function raises between any two lines of Python.
+    Inside of a lock's own code, such as that of numba's compiler, that would leave the lock taken for good.
+    """
+
+    @functools.wraps(function)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        trace = sys.gettrace()
+        sys.settrace(None)
+        try:
+            return function(*args, **kwargs)
+        finally:
+            sys.settrace(trace)
+
+    return wrapper

@@ -74,10 +74,7 @@ class Bar:
 def bar(description: str, total: float, done: float = 0, unit: str = "", visible: bool = True) -> Iterator[Bar]:
     """Shows how far some work is, within a `with`; nothing is shown where there is one thing to do in all.
 
-    Args:
-        description: what is being done, a word or two.
-        done: how much of it was done before.
-        unit: what is counted, for lines in a log.
+    The description is a word or two, `done` what was done before, and `unit` what is counted, for lines in a log.
     """
     with _shared_display() as display:
         number = display.add_task(

@@ -11,7 +11,7 @@ import torch
 from chromium import needs_chromium, open_tab
 from conftest import run_entrypoint
 from PIL import Image
-from small_scenes import HEIGHT, KINDS, WIDTH, psnr, scene
+from small_scenes import HEIGHT, KINDS, WIDTH, look_ahead, psnr, scene
 from torchvision.transforms.functional import to_tensor
 
 from sparsestyle_ns.cli import main
@@ -116,6 +116,19 @@ def test_a_browser_shows_what_the_twin_in_torch_says(tab, tmp_path, kind):
         assert expected.std() > 0.05  # there is something to see
         # A screen has 256 shades: rounding alone leaves 59 dB. Cells' borders are where float32 puts them.
         assert psnr(shown(tab), expected) > 45
+
+
+@needs_chromium
+def test_a_camera_that_has_flown_into_a_forward_facing_scene_sees_only_what_is_ahead_of_it(tab, tmp_path):
+    small, path = scene("ndc"), tmp_path / "page.html"
+    small.cameras = look_ahead((0.0, 0.0, 0.0), (-0.2, 0.1, -2.1))  # past the nearest things
+    small.title, small.names = "Inside", ["0.png", "1.png"]
+    path.write_bytes(build_page(small.voxels, small, small.orbit))
+    tab.open(f"{path.as_uri()}#view=1&size={WIDTH}x{HEIGHT}")
+    tab.wait_for(READY)
+    expected = picture_of_voxels(small.voxels, small.model, small.cameras[1:])
+    assert expected.std() > 0.05
+    assert psnr(shown(tab), expected) > 45
 
 
 @needs_chromium

@@ -16,9 +16,8 @@ from PIL import Image
 from sparsestyle_ns import cli
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
+from sparsestyle_ns.engine.previews import preview_path
 from sparsestyle_ns.studies import paper_tables, run_figures
-from sparsestyle_ns.studies.options import StudyOptions
-from sparsestyle_ns.studies.page import study_page
 from sparsestyle_ns.studies.paper_runs import COARSE_KINDS, STYLE_KINDS, PaperRuns
 from sparsestyle_ns.studies.paper_tables import (
     OF_METHODS,
@@ -32,8 +31,10 @@ from sparsestyle_ns.studies.paper_tables import (
     study_sections,
 )
 from sparsestyle_ns.studies.run_figures import PaintingMeasure, measure_run
-from sparsestyle_ns.studies.runs import Run, RunQueue, picture_after
+from sparsestyle_ns.studies.run_queue import Run, RunQueue
 from sparsestyle_ns.studies.study import Study
+from sparsestyle_ns.studies.study_options import StudyOptions
+from sparsestyle_ns.studies.study_page import study_page
 from sparsestyle_ns.style.backbones import BACKBONES
 
 
@@ -219,7 +220,7 @@ def test_ablations_set_out_each_comparison_with_traces_and_pictures_on_the_way(
     runs: SimpleNamespace, painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     coarse, style = (shutil.copytree(run, tmp_path / "s" / run.parent.name / "r") for run in (runs.coarse, runs.style))
-    Image.new("RGB", (32, 24)).save(picture_after(style, 20))
+    Image.new("RGB", (32, 24)).save(preview_path(style, 20))
     monkeypatch.setattr(Run, "folder", property(lambda run: style if run.coarse else coarse))
     every = ablations(tuple(COARSE_KINDS))
     sections = study_sections(paper_runs(style_iterations=3), every, tuple(COARSE_KINDS), [painting])

@@ -18,8 +18,8 @@ from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.studies import tradeoff
 from sparsestyle_ns.studies.measure_training import StageRuns
-from sparsestyle_ns.studies.options import TradeoffOptions
 from sparsestyle_ns.studies.study import Study, get_setting
+from sparsestyle_ns.studies.study_options import TradeoffOptions
 from sparsestyle_ns.studies.time_budget import Budget
 from sparsestyle_ns.studies.workbench import Workbench, squeezed
 from sparsestyle_ns.utils.errors import InputError

@@ -100,8 +100,8 @@ def test_a_point_measured_on_a_busy_machine_stays_marked():
 def test_the_recommendation_is_derived_from_the_measurements():
     line, *_ = recommendation([training_curve()])
     assert line.startswith(
-        "Iterations of stage 1 (--max-num-iterations): for a draft 400 (40 s, 19.1 dB); "
-        "for the best result 1600 (2:40 min, 20.1 dB); after that 1 dB more takes 4× the time"
+        "Iterations of stage 1 (--max-num-iterations): 400 for a draft (40 s, 19.1 dB), "
+        "1600 for the best result (2:40 min, 20.1 dB); after that 1 dB more takes 4× the time"
     )
     assert "measured once" in line
 
@@ -193,7 +193,7 @@ def test_the_page_needs_nothing_else_and_trusts_no_name(tmp_path):
     assert len(plots) == 1 + 1 + 1 + 2
     assert all(b"<svg" in plot for plot in plots)
     assert "a &lt;CPU&gt;" in page
-    assert "for a draft 400 (40 s, 19.1 dB)" in page
+    assert "400 for a draft (40 s, 19.1 dB)" in page
     assert page.index("In short") < page.index("Quadrature")
     assert (tmp_path / "tradeoff.png").read_bytes().startswith(b"\x89PNG")
 

@@ -3,7 +3,7 @@ import threading
 
 import pytest
 
-from sparsestyle_ns.utils.untraced import untraced
+from sparsestyle_ns.utils.numba_kernels import untraced
 
 
 class BrokenOffError(Exception):

@@ -36,8 +36,11 @@ bool enter_ndc(vec3 origin, vec3 direction) {
     vec3 on_near_plane = vec3(u_focal_over_half_size * crossing / u_near, -1.0);
     vec3 at_infinity = vec3(-u_focal_over_half_size * slope, 1.0);
     vec3 line = at_infinity - on_near_plane, scale = 2.0 / (u_maximum - u_minimum);
-    start = (on_near_plane + u_depths.x * line - u_minimum) * scale - 1.0;
-    extent = (u_depths.y - u_depths.x) * line * scale;
+    // A camera that has flown past the nearest thing doesn't see what is behind it.
+    float own = 1.0 + u_near / min(origin.z, -MIN_FORWARD * u_near);
+    float first = clamp(own, u_depths.x, u_depths.y);
+    start = (on_near_plane + first * line - u_minimum) * scale - 1.0;
+    extent = (u_depths.y - first) * line * scale;
     return true;
 }
 

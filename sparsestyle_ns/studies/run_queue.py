@@ -18,7 +18,6 @@ from typing import Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence
 import torch
 import yaml
 
-from sparsestyle_ns.engine.previews import preview_path
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.studies.study import Stage, Study
@@ -49,7 +48,7 @@ class Run:
         settings: beside the preset's, by their place in the config, as pairs.
         painting: the style image, of a stylised run.
         coarse: the run whose field it stylises.
-        pictures: iterations after which a picture is made of it on its way (see `picture_after`).
+        pictures: iterations after which a picture is made of it on its way (see `preview_path`).
     """
 
     study: Study
@@ -112,11 +111,6 @@ class Run:
         elif self.coarse is not None:
             config.pipeline.coarse_run = self.coarse.folder
         return config
-
-
-def picture_after(folder: Path, iterations: int) -> Path:
-    """Where a run's picture after so many iterations is: a held-out photo, the unstylised view and the stylised one."""
-    return preview_path(folder, iterations)
 
 
 class TimeSpent(NamedTuple):

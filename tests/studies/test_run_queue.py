@@ -10,11 +10,10 @@ import pytest
 from conftest import TINY
 
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.engine.previews import preview_steps
-from sparsestyle_ns.studies import runs as runs_module
-from sparsestyle_ns.studies import training_process
+from sparsestyle_ns.engine.previews import preview_path, preview_steps
+from sparsestyle_ns.studies import run_queue, training_process
 from sparsestyle_ns.studies.paper_runs import PaperRuns
-from sparsestyle_ns.studies.runs import SECONDS_FILE, Run, RunQueue, picture_after
+from sparsestyle_ns.studies.run_queue import SECONDS_FILE, Run, RunQueue
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress_file import PROGRESS_FILE, ProgressReport
@@ -56,7 +55,7 @@ def queue(coarse: Run, monkeypatch: pytest.MonkeyPatch) -> RunQueue:
         return {"folder": str(run.folder), "iterations": run.iterations}
 
     monkeypatch.setattr(Run, "config", config)
-    monkeypatch.setattr(runs_module, "TRAINING_PROCESS", (sys.executable, "-c", PRETEND))
+    monkeypatch.setattr(run_queue, "TRAINING_PROCESS", (sys.executable, "-c", PRETEND))
     said: List[str] = []
     found = RunQueue(coarse.folder.parents[1], jobs=1, say=said.append)
     found.said, found.trained = said, trained
@@ -164,10 +163,10 @@ raise SystemExit(1)
 def test_a_run_that_fails_is_named_with_what_it_reports_and_its_log(
     queue: RunQueue, coarse: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runs_module, "TRAINING_PROCESS", (sys.executable, "-c", FAILING))
+    monkeypatch.setattr(run_queue, "TRAINING_PROCESS", (sys.executable, "-c", FAILING))
     with pytest.raises(InputError, match=r"ours-[0-9a-f]{8} didn't finish \(Error: the scene is gone\).*\.log"):
         queue.train([coarse])
-    monkeypatch.setattr(runs_module, "TRAINING_PROCESS", (sys.executable, "-c", "raise SystemExit(3)"))
+    monkeypatch.setattr(run_queue, "TRAINING_PROCESS", (sys.executable, "-c", "raise SystemExit(3)"))
     with pytest.raises(InputError, match=r"didn't finish \(its process ended with status 3\)"):
         queue.train([coarse])
 
@@ -234,9 +233,9 @@ def test_how_far_a_run_is_is_shown_by_what_it_reports(
     queue: RunQueue, coarse: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reached = []
-    monkeypatch.setattr(runs_module, "SECONDS_BETWEEN_LOOKS", 0.05)
+    monkeypatch.setattr(run_queue, "SECONDS_BETWEEN_LOOKS", 0.05)
     monkeypatch.setattr("sparsestyle_ns.utils.progress.Bar.reach", lambda bar, done: reached.append(done))
-    monkeypatch.setattr(runs_module, "TRAINING_PROCESS", (sys.executable, "-c", SLOW))
+    monkeypatch.setattr(run_queue, "TRAINING_PROCESS", (sys.executable, "-c", SLOW))
     with pytest.raises(InputError, match="didn't finish"):
         queue.train([coarse])
     assert set(reached) == {7}
@@ -250,5 +249,5 @@ def test_a_run_is_one_of_ns_train_in_a_process_of_its_own(llff_scene: Path, tmp_
     assert run.is_finished
     assert json.loads((run.folder / "scene.json").read_text())["view_ids"] == [1, 11]
     assert (run.folder / "config.yml").is_file()
-    assert picture_after(run.folder, 1).is_file() and picture_after(run.folder, 2).is_file()
+    assert preview_path(run.folder, 1).is_file() and preview_path(run.folder, 2).is_file()
     assert said[-1].startswith(f"{run.folder.name}: 2 iterations in")
