@@ -1,6 +1,5 @@
 """A curve of error against time: what was measured at each value of one setting."""
 
-import math
 import statistics
 from dataclasses import dataclass, field
 from typing import Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple, Union
@@ -58,19 +57,16 @@ class Spread(NamedTuple):
 
 @dataclass
 class Point:
-    """What was measured at one value of the setting, or at one moment of a run with it.
-
-    Attributes:
-        setting: the value, as typed after the flag.
-        moment: when in a run it was measured, in words; empty where there is no run.
-        values: every repetition of every metric.
-        busy: whether other processes kept the machine busy during any of them.
-    """
+    """What was measured at one value of the setting, or at one moment of a run with it."""
 
     setting: str
+    """The value, as typed after the flag."""
     moment: str = ""
+    """When in a run it was measured, in words; empty where there is no run."""
     values: Dict[str, List[float]] = field(default_factory=dict)
+    """Every repetition of every metric."""
     busy: bool = False
+    """Whether other processes kept the machine busy during any of them."""
 
     @property
     def name(self) -> str:
@@ -92,18 +88,13 @@ class Curve:
     """A curve of error against time for one setting.
 
     Attributes:
-        group: what it is part of.
-        name: unique.
-        title: in words.
-        flag: the setting's flag on the command line.
-        preset: its value in the preset, as typed after the flag.
+        preset: the setting's value in the preset, as typed after its flag.
         time, error: the metrics between which there is to choose; smaller is better. An error of `psnr` stands for
             the root mean square error with that PSNR.
         plots: (x, y) metrics of each plot; the first is the main one.
         note: how it was measured.
         own_error: root mean square error of the field against held-out photos. Given, the error is one that only
             saves time and may cost `FREE_LOSS` dB more than need be; None: the knee is recommended.
-        points: in order of measuring.
         left_out: values that weren't measured, and why.
         order: the observed order of convergence.
     """
@@ -190,29 +181,10 @@ class Curve:
             f"{decibels(self.free_error):.1f} dB here are enough."
         )
 
-    def content(self) -> Dict[str, object]:
-        """What the JSON report says of the curve."""
-        front, recommended = self.front, self.recommended
-        named = ("group", "name", "title", "flag", "preset", "time", "error", "rule", "note", "left_out")
-        return {
-            **{name: getattr(self, name) for name in named},
-            "plots": [list(plot) for plot in self.plots],
-            "metrics": {metric: METRICS[metric].label for metric in self.metrics},
-            "observed_order": self.order,
-            "points": [
-                {
-                    "setting": point.setting,
-                    "moment": point.moment,
-                    "on_front": point in front,
-                    "recommended": point is recommended,
-                    "busy": point.busy,
-                    "values": {metric: _for_json(point.spread(metric)) for metric in point.values},
-                }
-                for point in self.points
-            ],
-        }
-
-
-def _for_json(spread: Spread) -> Dict[str, Optional[float]]:
-    """JSON has no infinity: None for it (the PSNR of equal pictures)."""
-    return {name: value if math.isfinite(value) else None for name, value in spread._asdict().items()}
+    def marked_points(self) -> List[Tuple[Point, Dict[str, bool]]]:
+        """The points, in order of measuring, and what is to be said of each."""
+        front, chosen = self.front, self.recommended
+        return [
+            (point, {"on_front": point in front, "recommended": point is chosen, "busy": point.busy})
+            for point in self.points
+        ]

@@ -1,20 +1,23 @@
 """Runs of both stages: what held-out views are like, against the time of training, of an iteration, and memory."""
 
 import math
+import statistics
 from typing import Dict, List, NamedTuple, Sequence, Tuple
 
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.studies.curves import Curve, Values
-from sparsestyle_ns.studies.study import flag_of, get_setting, with_setting
+from sparsestyle_ns.studies.study import get_setting, with_setting
 from sparsestyle_ns.studies.study_options import Group
 from sparsestyle_ns.studies.time_budget import Budget, Case, OutOfTimeError, Plan, in_turns
-from sparsestyle_ns.studies.workbench import Workbench, squeezed
+from sparsestyle_ns.studies.workbench import Workbench, setting_curve, squeezed
 from sparsestyle_ns.utils.machine import PeakMemory
 
 LONG_STOPS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1)
 SHORT_STOPS = (1 / 4, 1 / 2, 1)
 """Shares of a run at which it is evaluated."""
 MIN_ITERATIONS = 3
+PROBE_STEPS = 3
+"""Iterations from which the time of one is estimated, after one that doesn't count."""
 EVALUATION_SHARE = 0.3
 """Part of a run's time that evaluating it may take; how often, and on how many views, follows from it."""
 WARM_START_SHARE = 0.8
@@ -88,12 +91,11 @@ class StageRuns:
         return Plan(list(curves.values()), weight, lambda budget: self._short(curves, budget))
 
     def _curve(self, group: Group, name: str, title: str, place: str) -> Curve:
-        time, plots = "train_seconds", [("train_seconds", metric) for metric in self.metrics]
+        time = "step_seconds" if group == "fine-field" else "train_seconds"
+        plots = [(time, metric) for metric in self.metrics]
         if group == "fine-field":
-            time = "step_seconds"
-            plots = [*((time, metric) for metric in self.metrics), ("memory_mb", self.metrics[0])]
-        preset = str(get_setting(self.preset, place))
-        return Curve(group, name, title, flag_of(place), preset, time, self.metrics[0], plots)
+            plots.append(("memory_mb", self.metrics[0]))
+        return setting_curve(self.preset, place, group, name, title, plots)
 
     def _config(self) -> SparseStyleTrainerConfig:
         return self.bench.adapted_style_config() if self.is_style else self.preset
@@ -101,8 +103,7 @@ class StageRuns:
     def _fitting(self, config: SparseStyleTrainerConfig, budget: Budget, shares: Sequence[float]) -> RunPlan:
         """A run that fits into the budget; a few iterations, and a view, are tried to find out.
 
-        Args:
-            shares: of the run, at which it is evaluated where there is time for all of them.
+        It is evaluated at `shares` of it, where there is time for all of them.
         """
         bench = self.bench
         budget.check()
@@ -112,7 +113,8 @@ class StageRuns:
                 bench.start(config, budget)  # freezes the views, once for all runs
                 budget.check()
         setup, probe = bench.timed(lambda: bench.start(config, budget))
-        step, model = bench.step_seconds(probe, budget), probe.pipeline.model
+        steps, model = bench.train(probe, 1 + PROBE_STEPS, budget), probe.pipeline.model
+        budget.check()
         if type(model) not in bench.view_seconds:
             bench.evaluate(model, bench.views[:1])
         seconds = max(bench.view_seconds[type(model)], 1e-9)
@@ -120,8 +122,8 @@ class StageRuns:
         shares = shares[-max(1, int(EVALUATION_SHARE * budget.left / seconds)) :]
         views = bench.views[: max(1, int(EVALUATION_SHARE * budget.left / (len(shares) * seconds)))]
         left = budget.left - setup - len(shares) * len(views) * seconds
-        fitting = max(MIN_ITERATIONS, int((WARM_START_SHARE if self.is_style else 1.0) * left / step))
-        iterations = min(config.max_num_iterations, fitting)
+        fitting = int((WARM_START_SHARE if self.is_style else 1.0) * left / statistics.mean(steps[1:]))
+        iterations = min(config.max_num_iterations, max(MIN_ITERATIONS, fitting))
         return RunPlan(iterations, sorted({math.ceil(iterations * share) for share in shares}), views)
 
     def _long(self, curve: Curve, budget: Budget) -> None:
@@ -138,7 +140,7 @@ class StageRuns:
             bench.keep_style(model)
         for stop in plan.stops:
             with bench.watch:
-                seconds += sum(bench.train(training, stop, budget, bench.seconds_to_evaluate(model, plan.views)))
+                seconds += sum(bench.train(training, stop, budget, plan.views))
             if not self.is_style and bench.trains_coarse:
                 bench.keep_coarse(model)
             values = {"train_seconds": seconds, **bench.evaluate(model, plan.views)}
@@ -172,9 +174,7 @@ class StageRuns:
     ) -> Dict[str, Values]:
         """What was found at the stops of one run, and as that of no moment, of its iterations.
 
-        Raises:
-            OutOfTimeError: it was stopped before its end in stage 2: fewer iterations than the others have can't be set
-                beside them.
+        A run of stage 2 that is out of time before its end gives nothing: the others have more iterations.
         """
         bench = self.bench
         bench.collect_garbage()  # what is left of the run before would count as this one's memory
@@ -187,7 +187,7 @@ class StageRuns:
         model, steps, memory, found = training.pipeline.model, [], 0, {}
         for number, stop in enumerate(plan.stops, 1):
             with PeakMemory(bench.device) as peak:
-                steps += bench.train(training, stop, budget, bench.seconds_to_evaluate(model, plan.views))
+                steps += bench.train(training, stop, budget, plan.views)
             if self.is_style and training.num_steps < stop:
                 raise OutOfTimeError
             memory, values = max(memory, peak.bytes), bench.evaluate(model, plan.views)

@@ -1,8 +1,9 @@
 """Plots of losses in training, and of curves of error against time."""
 
+import contextlib
 import io
 import math
-from typing import List, Mapping, Sequence, Tuple
+from typing import Iterator, List, Mapping, Sequence, Tuple
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -32,31 +33,21 @@ COLUMNS = 3
 def line_plot(
     series: Mapping[str, Tuple[Sequence[float], Sequence[float]]], x_label: str, y_label: str, marks: bool = False
 ) -> str:
-    """Lines with a legend as SVG.
-
-    Args:
-        series: x and y values of each line, by name.
-        x_label: below the axis.
-        y_label: beside it.
-        marks: whether the end of each line is marked with a dot.
-    """
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=SIZE, layout="constrained")
-        cell = figure.subplots()
+    """Lines with a legend as SVG: x and y values of each by its name; `marks` puts a dot at their ends."""
+    with _svg() as (cell, svg):
         for name, (x, y) in series.items():
             cell.plot(x, y, label=name, linewidth=1.5, marker="o" if marks else "", markevery=[-1])
         cell.set(xlabel=x_label, ylabel=y_label)
         cell.legend()
         cell.grid(True, **GRID)
-        return _as_svg(figure)
+    return svg.getvalue()
 
 
 def curve_plot(curve: Curve, x: str, y: str) -> str:
     """Two metrics of a curve as SVG."""
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=SIZE, layout="constrained")
-        _draw(figure.subplots(), curve, x, y)
-        return _as_svg(figure)
+    with _svg() as (cell, svg):
+        _draw(cell, curve, x, y)
+    return svg.getvalue()
 
 
 def overview(curves: Sequence[Curve]) -> bytes:
@@ -75,10 +66,13 @@ def overview(curves: Sequence[Curve]) -> bytes:
     return buffer.getvalue()
 
 
-def _as_svg(figure: Figure) -> str:
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
+@contextlib.contextmanager
+def _svg() -> Iterator[Tuple[Axes, io.StringIO]]:
+    """A plot to draw into, and what it is written to in the end."""
+    with matplotlib.rc_context(STYLE):
+        figure, svg = Figure(figsize=SIZE, layout="constrained"), io.StringIO()
+        yield figure.subplots(), svg
+        figure.savefig(svg, format="svg", metadata={"Date": None})
 
 
 def _draw(cell: Axes, curve: Curve, x: str, y: str) -> None:

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.engine.hints import finish, scene_arguments
-from sparsestyle_ns.studies.measure_rendering import baking_plan, precision_plan, quadrature_plans
+from sparsestyle_ns.studies.measure_rendering import altered, baking_plan, precision_plan, quadrature_plans
 from sparsestyle_ns.studies.measure_training import StageRuns
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.studies.study_options import TradeoffOptions
@@ -31,11 +31,7 @@ REPORT_SHARE = 0.05
 
 
 def tradeoff(options: TradeoffOptions) -> None:
-    """Measures, writes the report, and prints the recommendation.
-
-    Raises:
-        InputError: something in the options can't be used.
-    """
+    """Measures, writes the report, and prints the recommendation; an `InputError` if an option can't be used."""
     budget_seconds = parse_duration(options.budget)
     if options.rounds < 1:
         raise InputError(f"--rounds is {options.rounds}, but has to be at least 1.")
@@ -69,9 +65,7 @@ def study_of(options: TradeoffOptions) -> Study:
 
 
 def measure(study: Study, options: TradeoffOptions, budget: Budget) -> Report:
-    """Measures what fits into the budget.
-
-    Ctrl-C ends it; what has been measured is in the report.
+    """Measures what fits into the budget; Ctrl-C ends it, and what has been measured is in the report.
 
     Raises:
         InputError: the scene, the painting or the coarse run can't be used.
@@ -125,11 +119,7 @@ def all_plans(bench: Workbench, options: TradeoffOptions) -> Tuple[List[Plan], L
 
 
 def check_folder(folder: Path) -> None:
-    """Makes the folder of the report before anything is measured.
-
-    Raises:
-        InputError: it can't be written to.
-    """
+    """Makes the folder of the report before anything is measured; an `InputError` if it can't be written to."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -141,17 +131,9 @@ def check_folder(folder: Path) -> None:
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
     """Keeps nerfstudio's and the methods' lines and warnings from the terminal."""
-    consoles = (CONSOLE, rich.get_console())
-    before = [console.quiet for console in consoles]
-    for console in consoles:
-        console.quiet = True
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        for console, was in zip(consoles, before, strict=True):
-            console.quiet = was
+    with altered(CONSOLE, quiet=True), altered(rich.get_console(), quiet=True), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 def facts(bench: Workbench, options: TradeoffOptions, seconds: float) -> Dict[str, Fact]:
