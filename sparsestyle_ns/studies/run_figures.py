@@ -39,17 +39,14 @@ Trace = Tuple[List[int], List[float]]
 
 @dataclass
 class RunFigures:
-    """What a row of a table shows.
-
-    Attributes:
-        figures: as `PathFrames.figures` and `stylisation_figures` name them, and `unstylised_ssim`.
-        pictures: PNG files of the path's first, middle and last frame.
-        coarse_pictures: the same, unstylised.
-    """
+    """What a row of a table shows."""
 
     figures: Dict[str, float]
+    """As `PathFrames.figures` and `stylisation_figures` name them, and `unstylised_ssim`."""
     pictures: List[Path]
+    """PNG files of the path's first, middle and last frame."""
     coarse_pictures: List[Path] = field(default_factory=list)
+    """The same, unstylised."""
 
 
 class PaintingMeasure:
@@ -63,9 +60,7 @@ class PaintingMeasure:
     def figures(self, frames: PathFrames, settings: HierStylePipelineConfig) -> Dict[str, float]:
         """Style strength and content kept, means over every `STYLE_EVERY`th frame, and ArtFID of all of these.
 
-        Args:
-            frames: the frames.
-            settings: the pipeline's config of a run; it names network and sizes.
+        `settings` of a run's pipeline name network and sizes.
         """
         if self._targets is None:
             settings = replace(settings, style_image=self.painting)
@@ -93,14 +88,9 @@ def measure_frames(
 ) -> Dict[str, RunFigures]:
     """What is measured of frames that are stylised in several ways, by the ways' names; known figures are read again.
 
-    Args:
-        folder: of the run whose unstylised frames and geometry all are compared with.
-        painting: the painting.
-        stylised_by: what makes the frames.
+    All are compared with the unstylised frames and the geometry of the run in a folder.
     """
-    checkpoint = newest_checkpoint(folder / "nerfstudio_models")
-    assert checkpoint is not None, folder
-    step = checkpoint_step(checkpoint)
+    step = checkpoint_step(newest_checkpoint(folder / "nerfstudio_models"))
     targets = {name: folder / ("measured" + (f"-{name}" if name else "")) for name in stylised_by}
     missing = [name for name, target in targets.items() if read_figures(target, step) is None]
     if missing:
@@ -118,8 +108,8 @@ def _save_figures(folder: Path, step: int, frames: PathFrames, figures: Mapping[
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     for place, index in enumerate((0, len(frames.stylised) // 2, len(frames.stylised) - 1)):
-        save_picture(frames.stylised[index], folder / f"stylised-{place}.png")
-        save_picture(frames.coarse[index], folder / f"coarse-{place}.png")
+        for name, pictures in (("stylised", frames.stylised), ("coarse", frames.coarse)):
+            save_image(pictures[index].detach().cpu().permute(2, 0, 1), folder / f"{name}-{place}.png")
     # Last, so that a folder with figures is a whole one.
     write_whole(folder / "figures.json", json.dumps({"step": step, "figures": figures}, indent=1) + "\n")
 
@@ -139,16 +129,10 @@ def read_figures(folder: Path, step: int) -> Optional[RunFigures]:
 
 def measure_coarse(folder: Path) -> Dict[str, float]:
     """A coarse run's figures on its held-out views, kept beside it."""
-    checkpoint = newest_checkpoint(folder / "nerfstudio_models")
-    known = None if checkpoint is None else saved_report(folder, checkpoint_step(checkpoint))
+    known = saved_report(folder, checkpoint_step(newest_checkpoint(folder / "nerfstudio_models")))
     if known is not None and ("lpips" in known.means or not has_lpips()):
         return known.means
     return evaluate_run(folder / "config.yml", folder / REPORT_FILE).means
-
-
-def save_picture(picture: Float[Tensor, "H W 3"], path: Path) -> None:
-    """Saves a picture in [0, 1]."""
-    save_image(picture.detach().cpu().permute(2, 0, 1), path)
 
 
 def loss_traces(folder: Path) -> Dict[str, Trace]:

@@ -34,31 +34,27 @@ SECONDS_BETWEEN_LOOKS = 2.0
 """At how far a run is."""
 PICTURE_SIDE = 256
 """Longer side, in pixels, of pictures of a run on its way."""
+Settings = Mapping[str, object]
+"""Values by their place in a method's config."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """A training run that a table needs.
-
-    Attributes:
-        study: its scene and presets.
-        output_dir: what `ns-train --output-dir` names.
-        name: short name, part of the run's folder.
-        stage: which of the two.
-        settings: beside the preset's, by their place in the config, as pairs.
-        painting: the style image, of a stylised run.
-        coarse: the run whose field it stylises.
-        pictures: iterations after which a picture is made of it on its way (see `preview_path`).
-    """
+    """A training run that a table needs."""
 
     study: Study
     output_dir: Path
+    """What `ns-train --output-dir` names."""
     name: str
+    """Part of the run's folder."""
     stage: Stage
     settings: Tuple[Tuple[str, object], ...] = ()
+    """`Settings` beside the preset's, as pairs."""
     painting: Optional[Path] = None
     coarse: Optional["Run"] = None
+    """The run whose field it stylises."""
     pictures: Tuple[int, ...] = ()
+    """Iterations after which a picture is made of it on its way (see `preview_path`)."""
 
     @property
     def method(self) -> str:
@@ -116,31 +112,28 @@ class Run:
 class TimeSpent(NamedTuple):
     """What a run has taken so far, all its processes together."""
 
-    seconds: float
-    iterations: int
+    seconds: float = 0.0
+    iterations: int = 0
 
     @classmethod
     def read(cls, path: Path) -> "TimeSpent":
         """From a file; nothing where there is none, or one that was cut short."""
         try:
             return cls(**json.loads(path.read_text()))
-        except (OSError, ValueError, TypeError):
-            return cls(0.0, 0)
+        except (OSError, ValueError):
+            return cls()
 
 
 @dataclass
 class RunQueue:
-    """Trains the runs of one study.
-
-    Attributes:
-        folder: where they all are; has their logs, too.
-        jobs: runs at a time; None for one on a machine of few cores or with a GPU, else one for every four cores.
-        say: told what goes on, a line at a time.
-    """
+    """Trains the runs of one study."""
 
     folder: Path
+    """Where they all are; has their logs, too."""
     jobs: Optional[int] = None
+    """Runs at a time; None for one on a machine of few cores or with a GPU, else one for every four cores."""
     say: Callable[[str], None] = say
+    """Told what goes on, a line at a time."""
 
     def train(self, runs: Sequence[Run]) -> None:
         """Brings all runs, and the coarse ones they build on, to their end; named twice, one is trained once.
@@ -148,34 +141,33 @@ class RunQueue:
         Raises:
             InputError: a run failed, or Ctrl-C was pressed; either way what is done is kept.
         """
+        wanted = list(dict.fromkeys([*(run.coarse for run in runs if run.coarse is not None), *runs]))
+        self.say(self.forecast(wanted))
         try:
-            self._train_all(list(dict.fromkeys(runs)))
+            for has_coarse in (False, True):
+                stage = [run for run in wanted if (run.coarse is not None) is has_coarse and not run.is_finished]
+                self._train_beside_each_other(stage, wanted)
         except KeyboardInterrupt as interrupt:
             raise InputError("Interrupted; the same command goes on where it was.") from interrupt
 
-    def _train_all(self, runs: Sequence[Run]) -> None:
-        coarse = list(dict.fromkeys(run.coarse for run in runs if run.coarse is not None))
-        wanted = [*coarse, *(run for run in runs if run not in coarse)]
-        self.say(self.forecast(wanted))
+    def _train_beside_each_other(self, runs: Sequence[Run], wanted: Sequence[Run]) -> None:
+        jobs = max(1, min(self._jobs(), len(runs)))
 
-        def train(run: Run, jobs: int) -> None:
+        def train(run: Run) -> None:
             self._train(run, jobs)
             if not all(other.is_finished for other in wanted):
                 self.say(self.forecast(wanted))
 
-        for stage in (coarse, runs):
-            left = [run for run in stage if not run.is_finished]
-            jobs = min(self._jobs(), len(left))
-            if jobs < 2:  # in this thread, which is the one that Ctrl-C reaches
-                for run in left:
-                    train(run, 1)
-                continue
-            with ThreadPoolExecutor(jobs) as pool:
-                try:
-                    list(pool.map(lambda run, jobs=jobs: train(run, jobs), left))
-                except BaseException:
-                    pool.shutdown(cancel_futures=True)
-                    raise
+        if jobs == 1:  # in this thread, which is the one that Ctrl-C reaches
+            for run in runs:
+                train(run)
+            return
+        with ThreadPoolExecutor(jobs) as pool:
+            try:
+                list(pool.map(train, runs))
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
 
     def forecast(self, wanted: Sequence[Run]) -> str:
         """How much is to do and how long it will take, by what earlier runs of the same methods took."""
@@ -243,8 +235,3 @@ def _follow(process: subprocess.Popen, progress: Path, name: str, iterations: in
                 for work in ProgressReport.read(progress).works:
                     if work.unit == "iterations":
                         shown.reach(work.done)
-
-
-def as_pairs(*settings: Mapping[str, object]) -> Tuple[Tuple[str, object], ...]:
-    """Settings as a run has them; of those that are given twice the last counts."""
-    return tuple({place: value for part in settings for place, value in part.items()}.items())

@@ -26,8 +26,8 @@ from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipe
 from sparsestyle_ns.pipelines.scene_views import SceneViews
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
 from sparsestyle_ns.runs.scene_record import record_scene
-from sparsestyle_ns.studies.pareto import root_mean_square
 from sparsestyle_ns.studies.curves import Curve
+from sparsestyle_ns.studies.pareto import root_mean_square
 from sparsestyle_ns.studies.study import Study, flag_of, get_setting
 from sparsestyle_ns.studies.study_options import Group
 from sparsestyle_ns.studies.time_budget import Budget, OutOfTimeError
