@@ -2,8 +2,7 @@
 
 from typing import List, Sequence
 
-from sparsestyle_ns.studies.curves import Curve, Point
-from sparsestyle_ns.studies.pareto import decibels_lost, time_factor_of_a_decibel
+from sparsestyle_ns.studies.curves import Curve, Point, decibels_lost, time_factor_of_a_decibel
 from sparsestyle_ns.utils import progress
 
 SMALL_GAIN = 0.05

@@ -1,49 +1,95 @@
-"""A curve of error against time: what was measured at each value of one setting."""
+"""A curve of error against time: what was measured at each value of one setting, and which point to choose."""
 
+import math
 import statistics
 from dataclasses import dataclass, field
 from typing import Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple, Union
 
-from sparsestyle_ns.studies.pareto import (
-    TIME_EXPONENT,
-    decibels,
-    decibels_lost,
-    error_that_costs,
-    fastest_within,
-    knee,
-    pareto_front,
-    root_mean_square,
-)
 from sparsestyle_ns.studies.study_options import Group
 
+TIME_EXPONENT = 1 / 8
+"""a of `knee`: twice the time is worth it where it takes off 1 − 2^−a = 8.3% of the error (0.75 dB of PSNR) or more."""
 Values = Mapping[str, Union[float, Sequence[float]]]
 """What one measurement found: a number, or several repetitions of it, for each metric."""
+METRICS = {
+    "iterations": "iterations",
+    "train_seconds": "seconds of training",
+    "step_seconds": "seconds an iteration",
+    "view_seconds": "seconds a view",
+    "fps": "frames a second",
+    "first_seconds": "seconds of the first picture",
+    "rmse": "root mean square error of colours",
+    "memory_mb": "peak memory (MB)",
+    "psnr": "PSNR (dB)",
+    "ssim": "SSIM",
+    "style_loss": "style loss, held-out views",
+    "content_loss": "content loss, held-out views",
+}
+"""Every number that is measured, in words. Those of PSNR and SSIM are better the larger, as frames a second are."""
+ON_LINEAR_SCALES = ("psnr", "ssim", "style_loss", "content_loss")
+"""All other metrics have logarithmic scales."""
 FREE_LOSS = 0.1
 """dB against the photos that nobody misses: what an error may cost that is there only to save time."""
 
 
-class Metric(NamedTuple):
-    """What a number is: in words, with its unit, and whether its scale is logarithmic."""
+def pareto_front(times: Sequence[float], errors: Sequence[float]) -> List[int]:
+    """The points that no other beats in both, from the fastest on; of points that are equal in both, the first."""
+    front: List[int] = []
+    for index in sorted(range(len(times)), key=lambda point: (times[point], errors[point])):
+        if not front or errors[index] < errors[front[-1]]:
+            front.append(index)
+    return front
 
-    label: str
-    log: bool = False
+
+def knee(times: Sequence[float], errors: Sequence[float], exponent: float = TIME_EXPONENT) -> Optional[int]:
+    """The point with the smallest error · time^a, of equals the fastest; None where there are no points.
+
+    It doesn't depend on the units of either, and lies on the front. Times and the exponent a are above 0.
+    """
+    front = pareto_front(times, errors)
+    return min(front, key=lambda point: errors[point] * times[point] ** exponent, default=None)
 
 
-METRICS = {
-    "iterations": Metric("iterations", log=True),
-    "train_seconds": Metric("seconds of training", log=True),
-    "step_seconds": Metric("seconds an iteration", log=True),
-    "view_seconds": Metric("seconds a view", log=True),
-    "fps": Metric("frames a second", log=True),
-    "first_seconds": Metric("seconds of the first picture", log=True),
-    "rmse": Metric("root mean square error of colours", log=True),
-    "psnr": Metric("PSNR (dB)"),
-    "ssim": Metric("SSIM"),
-    "style_loss": Metric("style loss, held-out views"),
-    "content_loss": Metric("content loss, held-out views"),
-    "memory_mb": Metric("peak memory (MB)", log=True),
-}
-"""Every number that is measured. Those of PSNR and SSIM are better the larger, as frames a second are."""
+def fastest_within(times: Sequence[float], errors: Sequence[float], limit: float) -> Optional[int]:
+    """The fastest point with an error of at most `limit`, else the most accurate; None where there are no points."""
+    front = pareto_front(times, errors)
+    within = [point for point in front if errors[point] <= limit]
+    return (within[:1] or front[-1:] or [None])[0]
+
+
+def observed_order(samples: Sequence[float], errors: Sequence[float]) -> Optional[float]:
+    """p of error ∝ samples^−p, by least squares of the logarithms; None without two points with an error."""
+    points = [(math.log(n), math.log(error)) for n, error in zip(samples, errors, strict=True) if error > 0]
+    if len({x for x, _ in points}) < 2:
+        return None
+    return -statistics.linear_regression(*zip(*points, strict=True)).slope
+
+
+def decibels(error: float) -> float:
+    """PSNR in dB of a root mean square error of colours in [0, 1]; infinite for 0."""
+    return -20.0 * math.log10(error) if error > 0 else math.inf
+
+
+def root_mean_square(psnr: float) -> float:
+    """The error that has this PSNR in dB."""
+    return 10.0 ** (-psnr / 20.0)
+
+
+def decibels_lost(error: float, own_error: float) -> float:
+    """dB of PSNR that an error costs which adds, independently, to another (both root mean squares)."""
+    return 10.0 * math.log10(1.0 + (error / own_error) ** 2)
+
+
+def error_that_costs(loss: float, own_error: float) -> float:
+    """The inverse of `decibels_lost`: the error that costs `loss` dB."""
+    return own_error * math.sqrt(10.0 ** (loss / 10.0) - 1.0)
+
+
+def time_factor_of_a_decibel(time: float, psnr: float, later_time: float, later_psnr: float) -> Optional[float]:
+    """How many times as long 1 dB more takes, at the rate between two points; None where nothing was gained."""
+    if later_psnr <= psnr or later_time <= time:
+        return None
+    return (later_time / time) ** (1.0 / (later_psnr - psnr))
 
 
 class Spread(NamedTuple):
@@ -146,18 +192,19 @@ class Curve:
         value = point.median(self.error)
         return root_mean_square(value) if self.error == "psnr" else value
 
+    @property
     def _times_and_errors(self) -> Tuple[List[float], List[float]]:
         return [point.median(self.time) for point in self.points], [self.error_of(point) for point in self.points]
 
     @property
     def front(self) -> List[Point]:
         """The Pareto front, from the fastest point on."""
-        return [self.points[index] for index in pareto_front(*self._times_and_errors())]
+        return [self.points[index] for index in pareto_front(*self._times_and_errors)]
 
     @property
     def recommended(self) -> Optional[Point]:
         """The point to choose, by `rule`."""
-        times, errors = self._times_and_errors()
+        times, errors = self._times_and_errors
         index = knee(times, errors) if self.own_error is None else fastest_within(times, errors, self.free_error)
         return None if index is None else self.points[index]
 

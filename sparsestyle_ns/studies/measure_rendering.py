@@ -20,8 +20,7 @@ from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.rendering.baked import BakedVolume, render_baked
 from sparsestyle_ns.rendering.render import POINTS_PER_CALL, render_coarse
-from sparsestyle_ns.studies.curves import Curve, Values
-from sparsestyle_ns.studies.pareto import decibels, observed_order
+from sparsestyle_ns.studies.curves import Curve, Values, decibels, observed_order
 from sparsestyle_ns.studies.study import with_setting
 from sparsestyle_ns.studies.time_budget import Budget, Case, Plan, in_turns
 from sparsestyle_ns.studies.workbench import Model, Workbench, setting_curve
@@ -60,7 +59,7 @@ def timed_and_compared(
 ) -> Dict[str, float]:
     """Seconds, scaled to a view, and difference of one render of some rays."""
     seconds, picture = bench.timed(lambda: render(rays))
-    return {"view_seconds": seconds * bench.pixels / len(rays), **difference(picture, reference)}
+    return {"view_seconds": seconds * math.prod(bench.size) / len(rays), **difference(picture, reference)}
 
 
 @torch.no_grad()
@@ -214,13 +213,10 @@ def occupancies(model: HierStyleModel, thresholds: Sequence[float], budget: Budg
             densities.append(model.field.density_and_feature(points)[0])
         return densities[-1]
 
-    def replay(known: Iterator[Tensor], _points: Tensor) -> Tensor:
-        return next(known)
-
     grids = {threshold: Occupancy(model.config.occupancy_resolution).to(model.device) for threshold in thresholds}
     for threshold, grid in grids.items():
-        density = functools.partial(replay, iter(densities)) if densities else evaluate
-        grid.measure(density, threshold, POINTS_PER_CALL)
+        known = iter(densities) if densities else None
+        grid.measure(evaluate if known is None else lambda _, known=known: next(known), threshold, POINTS_PER_CALL)
     return grids
 
 

@@ -1,8 +1,9 @@
 """Runs of both stages: what held-out views are like, against the time of training, of an iteration, and memory."""
 
+import gc
 import math
 import statistics
-from typing import Dict, List, NamedTuple, Sequence, Tuple
+from typing import Callable, Dict, List, NamedTuple, Sequence, Tuple
 
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.studies.curves import Curve, Values
@@ -30,30 +31,23 @@ class Knob(NamedTuple):
     name: str
     title: str
     place: str
-    factors: Tuple[float, ...] = ()
-    steps: Tuple[int, ...] = ()
-    values: Tuple[int, ...] = ()
-
-    def around(self, preset: int) -> Tuple[int, ...]:
-        """The values to measure: multiples of the preset's, steps from it, and values of their own."""
-        near = (*(int(preset * factor) for factor in self.factors), *(preset + step for step in self.steps))
-        return tuple(value for value in (*near, *self.values) if value >= 1)
+    around: Callable[[int], Tuple[int, ...]]
 
 
 KNOBS: Dict[Group, Tuple[Knob, ...]] = {
     "training": (
-        Knob("width", "Width of the coarse field", "pipeline.model.coarse_field.layer_width", (1 / 2, 1 / 4)),
-        Knob("levels", "Octaves of the encoding", "pipeline.model.coarse_field.num_levels", steps=(-2, 2)),
-        Knob("batch", "Rays a batch", "pipeline.datamanager.train_num_rays_per_batch", (1 / 4, 4)),
+        Knob("width", "Width of the field", "pipeline.model.coarse_field.layer_width", lambda n: (n // 2, n // 4)),
+        Knob("levels", "Octaves of the encoding", "pipeline.model.coarse_field.num_levels", lambda n: (n - 2, n + 2)),
+        Knob("batch", "Rays a batch", "pipeline.datamanager.train_num_rays_per_batch", lambda n: (n // 4, 4 * n)),
     ),
     "fine-field": (
-        Knob("hash levels", "Levels of the hash grid", "pipeline.model.hash_levels", (1 / 2, 2)),
-        Knob("resolution", "Finest level's cells", "pipeline.model.max_resolution", (1 / 2, 2)),
-        Knob("table", "Length of a level's table (log2)", "pipeline.model.log2_table_size", steps=(-2, -4)),
+        Knob("hash levels", "Levels of the hash grid", "pipeline.model.hash_levels", lambda n: (n // 2, 2 * n)),
+        Knob("resolution", "Finest level's cells", "pipeline.model.max_resolution", lambda n: (n // 2, 2 * n)),
+        Knob("table", "Length of a level's table (log2)", "pipeline.model.log2_table_size", lambda n: (n - 2, n - 4)),
     ),
     "style": (
-        Knob("feature size", "Size that the feature network sees", "pipeline.feature_side", (1 / 2, 2)),
-        Knob("style features", "Style features that count", "pipeline.style_features", values=(1024, 128)),
+        Knob("feature size", "Size that the feature network sees", "pipeline.feature_side", lambda n: (n // 2, 2 * n)),
+        Knob("style features", "Style features that count", "pipeline.style_features", lambda n: (1024, 128)),
     ),
 }
 
@@ -137,7 +131,7 @@ class StageRuns:
         training = bench.start(squeezed(config, plan.iterations), budget)
         model, seconds = training.pipeline.model, 0.0
         if self.is_style:
-            bench.keep_style(model)
+            bench.style_model, bench.is_stylised = model, True
         for stop in plan.stops:
             with bench.watch:
                 seconds += sum(bench.train(training, stop, budget, plan.views))
@@ -151,7 +145,7 @@ class StageRuns:
     def _short(self, curves: Dict[Knob, Curve], budget: Budget) -> None:
         bench, config = self.bench, self._config()
         presets = {knob: get_setting(config, knob.place) for knob in curves}
-        values = {knob: knob.around(preset) for knob, preset in presets.items()}
+        values = {knob: [n for n in knob.around(preset) if n >= 1] for knob, preset in presets.items()}
         share = budget.left / (1.5 + sum(map(len, values.values())))
         plan = self._fitting(config, budget.part(share), SHORT_STOPS[1:] if self.is_style else SHORT_STOPS)
         what = f"{plan.iterations} iterations" if self.is_style else f"{share:.3g} s with its evaluations"
@@ -177,7 +171,8 @@ class StageRuns:
         A run of stage 2 that is out of time before its end gives nothing: the others have more iterations.
         """
         bench = self.bench
-        bench.collect_garbage()  # what is left of the run before would count as this one's memory
+        gc.collect()  # what is left of the run before would count as this one's memory
+        gc.freeze()  # what is there before a run needn't be searched again, which takes most time
         if not self.is_style:
             budget = budget.part(seconds)
             iterations = self._fitting(config, budget, SHORT_STOPS).iterations

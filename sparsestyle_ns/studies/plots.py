@@ -11,7 +11,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from sparsestyle_ns.studies.curves import METRICS, Curve, Point
+from sparsestyle_ns.studies.curves import METRICS, ON_LINEAR_SCALES, Curve, Point
 
 COLORS = ("#33617f", "#b4492b", "#6a8f3c", "#8a5a9e", "#b58a2a", "#3f8f8a")
 CHOSEN, FRONT, GRID = "#b4492b", "#9aa5ab", {"color": "#e4e1da", "lw": 0.6}
@@ -110,9 +110,9 @@ def _draw(cell: Axes, curve: Curve, x: str, y: str) -> None:
         cell.plot(*places(front), "--", color=FRONT, lw=1, zorder=1)
     if curve.recommended in points:
         cell.plot(*places([curve.recommended]), "o", ms=13, mfc="none", mec=CHOSEN, mew=1.8, zorder=4)
-    cell.set(xlabel=METRICS[x].label, ylabel=METRICS[y].label)
+    cell.set(xlabel=METRICS[x], ylabel=METRICS[y])
     for metric, scale in ((x, cell.xaxis), (y, cell.yaxis)):
-        if METRICS[metric].log and all(point.median(metric) > 0 for point in points):
+        if metric not in ON_LINEAR_SCALES and all(point.median(metric) > 0 for point in points):
             _make_logarithmic(scale)
     cell.grid(True, which="major", **GRID)
     cell.margins(0.12)

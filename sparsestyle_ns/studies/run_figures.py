@@ -1,10 +1,11 @@
 """What is measured of a run. Everything is kept beside it, so that a table is made again without rendering again."""
 
+import functools
 import json
 import shutil
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Callable, Dict, List, Mapping, Optional, Tuple
+from typing import Callable, Dict, List, Optional, Sequence, Tuple
 
 import torch
 from jaxtyping import Float
@@ -26,12 +27,12 @@ from sparsestyle_ns.runs.run_folder import REPORT_FILE
 from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.progress import track
 
-OWN_FRAMES = ""
-"""Names the frames that a run itself renders."""
+FIGURES_FILE = "figures.json"
 STYLE_EVERY = 4
 """Style and content are measured on every fourth frame of the path: neighbours say the same."""
 
-Stylise = Callable[[PathFrames], List[Float[Tensor, "H W 3"]]]
+Frames = Sequence[Float[Tensor, "H W 3"]]
+Stylise = Callable[[PathFrames], Frames]
 """Makes stylised frames of a path's unstylised ones."""
 Trace = Tuple[List[int], List[float]]
 """Iterations, and the values of a loss there."""
@@ -78,53 +79,54 @@ class PaintingMeasure:
         return means | ({} if art_fid is None else art_fid.figures())
 
 
-def measure_run(folder: Path, painting: PaintingMeasure) -> RunFigures:
-    """What is measured of a stylised run, on the measuring path."""
-    return measure_frames(folder, painting, {OWN_FRAMES: lambda frames: frames.stylised})[OWN_FRAMES]
+def own_frames(frames: PathFrames) -> Frames:
+    """The frames that the run itself has stylised."""
+    return frames.stylised
 
 
-def measure_frames(
-    folder: Path, painting: PaintingMeasure, stylised_by: Mapping[str, Stylise]
-) -> Dict[str, RunFigures]:
-    """What is measured of frames that are stylised in several ways, by the ways' names; known figures are read again.
+def measure_run(folder: Path, painting: PaintingMeasure, way: str = "", stylise: Stylise = own_frames) -> RunFigures:
+    """What is measured of a stylised run on the measuring path; known figures are read again.
 
-    All are compared with the unstylised frames and the geometry of the run in a folder.
+    With the name of a way, and `stylise` for it, of frames stylised so in place of the run's own; they are compared
+    with the run's unstylised frames and its geometry.
     """
     step = checkpoint_step(newest_checkpoint(folder / "nerfstudio_models"))
-    targets = {name: folder / ("measured" + (f"-{name}" if name else "")) for name in stylised_by}
-    missing = [name for name, target in targets.items() if read_figures(target, step) is None]
-    if missing:
-        config, pipeline, _ = load_run(folder / "config.yml")
-        frames = render_path(pipeline.model, measuring_path(pipeline.datamanager.train_dataset.cameras))
-        for name in missing:
-            changed = replace(frames, stylised=stylised_by[name](frames))
-            figures = {**changed.figures(), **painting.figures(changed, config.pipeline)}
-            _save_figures(targets[name], step, changed, figures)
-    found = {name: read_figures(target, step) for name, target in targets.items()}
-    return {name: figures for name, figures in found.items() if figures is not None}
-
-
-def _save_figures(folder: Path, step: int, frames: PathFrames, figures: Mapping[str, float]) -> None:
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
+    target = folder / (f"measured-{way}" if way else "measured")
+    known = read_figures(target, step)
+    if known is not None:
+        return known
+    settings, frames = _render(folder, step)
+    frames = replace(frames, stylised=stylise(frames))
+    figures = {**frames.figures(), **painting.figures(frames, settings)}
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir()
     for place, index in enumerate((0, len(frames.stylised) // 2, len(frames.stylised) - 1)):
         for name, pictures in (("stylised", frames.stylised), ("coarse", frames.coarse)):
-            save_image(pictures[index].detach().cpu().permute(2, 0, 1), folder / f"{name}-{place}.png")
+            save_image(pictures[index].detach().cpu().permute(2, 0, 1), target / f"{name}-{place}.png")
     # Last, so that a folder with figures is a whole one.
-    write_whole(folder / "figures.json", json.dumps({"step": step, "figures": figures}, indent=1) + "\n")
+    write_whole(target / FIGURES_FILE, json.dumps({"step": step, "figures": figures}, indent=1) + "\n")
+    return RunFigures(figures, *_pictures(target))
+
+
+@functools.lru_cache(maxsize=1)
+def _render(folder: Path, _step: int) -> Tuple[HierStylePipelineConfig, PathFrames]:
+    config, pipeline, _ = load_run(folder / "config.yml")
+    return config.pipeline, render_path(pipeline.model, measuring_path(pipeline.datamanager.train_dataset.cameras))
+
+
+def _pictures(folder: Path) -> List[List[Path]]:
+    return [sorted(folder.glob(f"{name}-*.png")) for name in ("stylised", "coarse")]
 
 
 def read_figures(folder: Path, step: int) -> Optional[RunFigures]:
     """What was measured, if it is of that iteration and nothing can be measured by now that couldn't be then."""
     try:
-        content = json.loads((folder / "figures.json").read_text())
+        content = json.loads((folder / FIGURES_FILE).read_text())
     except (OSError, ValueError):  # there is none, or it was cut short
         return None
     figures = content["figures"]
     has_all = ("art_fid" in figures or missing_weights()) and ("short_lpips" in figures or not has_lpips())
-    if content["step"] != step or not has_all:
-        return None
-    return RunFigures(figures, *(sorted(folder.glob(f"{name}-*.png")) for name in ("stylised", "coarse")))
+    return RunFigures(figures, *_pictures(folder)) if content["step"] == step and has_all else None
 
 
 def measure_coarse(folder: Path) -> Dict[str, float]:

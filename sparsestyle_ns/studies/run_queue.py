@@ -13,7 +13,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple
+from typing import Callable, Dict, List, Mapping, Optional, Sequence, Tuple
 
 import torch
 import yaml
@@ -109,19 +109,12 @@ class Run:
         return config
 
 
-class TimeSpent(NamedTuple):
-    """What a run has taken so far, all its processes together."""
-
-    seconds: float = 0.0
-    iterations: int = 0
-
-    @classmethod
-    def read(cls, path: Path) -> "TimeSpent":
-        """From a file; nothing where there is none, or one that was cut short."""
-        try:
-            return cls(**json.loads(path.read_text()))
-        except (OSError, ValueError):
-            return cls()
+def time_spent(path: Path) -> Dict[str, float]:
+    """Seconds and iterations of all processes of a run so far; zeros where the file is missing or was cut short."""
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {"seconds": 0.0, "iterations": 0}
 
 
 @dataclass
@@ -191,9 +184,9 @@ class RunQueue:
         """Of each method the mean over its runs that are on this disk."""
         rates: Dict[str, List[float]] = {}
         for path in self.folder.glob(f"*/*/{SECONDS_FILE}"):
-            spent = TimeSpent.read(path)
-            if spent.iterations > 0:
-                rates.setdefault(path.parents[1].name, []).append(spent.seconds / spent.iterations)
+            spent = time_spent(path)
+            if spent["iterations"] > 0:
+                rates.setdefault(path.parents[1].name, []).append(spent["seconds"] / spent["iterations"])
         return {method: sum(values) / len(values) for method, values in rates.items()}
 
     def _train(self, run: Run, jobs: int) -> None:
@@ -216,10 +209,10 @@ class RunQueue:
         if process.returncode != 0 or not run.is_finished:
             failure = ProgressReport.read(progress).failure or f"its process ended with status {process.returncode}"
             raise InputError(f"The run {name} didn't finish ({failure}); all it said is in {log}.")
-        seconds, before = time.monotonic() - start, TimeSpent.read(run.folder / SECONDS_FILE)
+        seconds, spent = time.monotonic() - start, time_spent(run.folder / SECONDS_FILE)
         self.say(f"{name}: {total - done} iterations in {duration(seconds)}")
-        spent = TimeSpent(before.seconds + seconds, before.iterations + total - done)
-        write_whole(run.folder / SECONDS_FILE, json.dumps(spent._asdict()) + "\n")
+        spent = {"seconds": spent["seconds"] + seconds, "iterations": spent["iterations"] + total - done}
+        write_whole(run.folder / SECONDS_FILE, json.dumps(spent) + "\n")
 
 
 def _follow(process: subprocess.Popen, progress: Path, name: str, iterations: int, done: int) -> None:

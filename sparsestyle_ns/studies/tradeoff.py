@@ -52,16 +52,9 @@ def tradeoff(options: TradeoffOptions) -> None:
 
 def study_of(options: TradeoffOptions) -> Study:
     """The scene and the presets that the options name."""
-    return Study(
-        options.data,
-        parse_dataparser(options.dataparser, options.data),
-        draft=not options.full,
-        max_image_side=options.max_image_side,
-        num_views=options.num_views,
-        view_ids=options.view_ids,
-        vgg_weights=options.vgg_weights,
-        backbone=options.backbone,
-    )
+    named = ("max_image_side", "num_views", "view_ids", "vgg_weights", "backbone")
+    settings = {name: getattr(options, name) for name in named}
+    return Study(options.data, parse_dataparser(options.dataparser, options.data), draft=not options.full, **settings)
 
 
 def measure(study: Study, options: TradeoffOptions, budget: Budget) -> Report:
@@ -94,15 +87,12 @@ def measure(study: Study, options: TradeoffOptions, budget: Budget) -> Report:
 
 def all_plans(bench: Workbench, options: TradeoffOptions) -> Tuple[List[Plan], List[str]]:
     """What to measure, in order, and the groups that can't be, with the reason."""
-    asked = options.groups or tuple(GROUPS)
+    asked, has_style = options.groups or tuple(GROUPS), bench.targets is not None
     of_style = [group for group in ("fine-field", "style") if group in asked]
-    has_style = bench.targets is not None
     reason = "there is no painting; name one with --style-image."
     left_out = [] if has_style else [f"{GROUPS[group]}: {reason}" for group in of_style]
     coarse, style = StageRuns(bench, is_style=False), StageRuns(bench, is_style=True)
-    plans: List[Plan] = []
-    if "training" in asked or bench.trains_coarse:
-        plans.append(coarse.long_plan())
+    plans = [coarse.long_plan()] if "training" in asked or bench.trains_coarse else []
     if has_style and set(asked) != {"training"}:
         plans.append(style.long_plan())
     if "quadrature" in asked:

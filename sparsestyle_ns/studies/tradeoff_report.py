@@ -99,7 +99,7 @@ class Report:
 
 
 def cant_write(folder: Path, error: OSError) -> InputError:
-    """What to say where a report can't be written."""
+    """For where a report can't be written."""
     return InputError(f"The report can't be written to {folder} ({error.strerror}); name another --output-dir.")
 
 
@@ -127,7 +127,7 @@ def curve_content(curve: Curve) -> Dict[str, object]:
     named = ("group", "name", "title", "flag", "preset", "time", "error", "plots", "rule", "note", "left_out")
     return {
         **{name: getattr(curve, name) for name in named},
-        "metrics": {metric: METRICS[metric].label for metric in curve.metrics},
+        "metrics": {metric: METRICS[metric] for metric in curve.metrics},
         "observed_order": curve.order,
         "points": [
             {"setting": point.setting, "moment": point.moment, **marks}
@@ -150,7 +150,7 @@ def curve_section(curve: Curve) -> Section:
     """What the page shows of a curve that has points."""
     order = "" if curve.order is None else f" Observed order of convergence: {curve.order:.2f}."
     plots = [
-        (curve_plot(curve, x, y), f"{METRICS[y].label} against {METRICS[x].label}")
+        (curve_plot(curve, x, y), f"{METRICS[y]} against {METRICS[x]}")
         for x, y in curve.plots
         if any(x in point.values and y in point.values for point in curve.points)
     ]
@@ -158,7 +158,7 @@ def curve_section(curve: Curve) -> Section:
     for point, marks in curve.marked_points():
         said = ", ".join(mark.replace("_", " ") for mark, holds in marks.items() if holds)
         rows.append((point.name, [*(_cell(point, metric) for metric in curve.metrics), said]))
-    columns = [*(METRICS[metric].label for metric in curve.metrics), ""]
+    columns = [*(METRICS[metric] for metric in curve.metrics), ""]
     table = Table(f"{curve.flag}, preset: {curve.preset}", columns, rows)
     return Section(curve.title, tables=[table], plots=plots, note=f"{curve.rule}{order} {curve.note}")
 

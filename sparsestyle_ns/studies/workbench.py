@@ -1,9 +1,7 @@
 """What curves are measured on: a scene with its photos, and what has been trained on it so far."""
 
 import copy
-import gc
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Callable, Dict, List, Optional, Sequence, Tuple, TypeVar, Union
 
@@ -26,8 +24,7 @@ from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipe
 from sparsestyle_ns.pipelines.scene_views import SceneViews
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
 from sparsestyle_ns.runs.scene_record import record_scene
-from sparsestyle_ns.studies.curves import Curve
-from sparsestyle_ns.studies.pareto import root_mean_square
+from sparsestyle_ns.studies.curves import Curve, root_mean_square
 from sparsestyle_ns.studies.study import Study, flag_of, get_setting
 from sparsestyle_ns.studies.study_options import Group
 from sparsestyle_ns.studies.time_budget import Budget, OutOfTimeError
@@ -48,14 +45,12 @@ def squeezed(config: SparseStyleTrainerConfig, iterations: int) -> SparseStyleTr
     def scaled(count: int) -> int:
         return max(1, round(count * share))
 
-    config.max_num_iterations = iterations
-    for parts in config.optimizers.values():
-        scheduler = parts["scheduler"]
+    config.max_num_iterations, pipeline = iterations, config.pipeline
+    for scheduler in (parts["scheduler"] for parts in config.optimizers.values()):
         if isinstance(scheduler, ExponentialDecaySchedulerConfig):
-            parts["scheduler"] = replace(scheduler, max_steps=scaled(scheduler.max_steps))
+            scheduler.max_steps = scaled(scheduler.max_steps)
         elif isinstance(scheduler, MultiStepSchedulerConfig):
-            parts["scheduler"] = replace(scheduler, milestones=tuple(map(scaled, scheduler.milestones)))
-    pipeline = config.pipeline
+            scheduler.milestones = tuple(map(scaled, scheduler.milestones))
     if isinstance(pipeline, HierStylePipelineConfig):
         pipeline.content_steps = scaled(pipeline.content_steps)
         pipeline.warm_start_steps = scaled(pipeline.warm_start_steps) if pipeline.warm_start_steps else 0
@@ -90,9 +85,8 @@ class Workbench:
         coarse_run: Optional[Path] = None,
         rounds: int = 1,
     ) -> None:
-        self.study, self.budget, self.clock, self.rounds = study, budget, budget.clock, rounds
+        self.study, self.budget, self.rounds, self.watch = study, budget, rounds, LoadWatch()
         self.trains_coarse = coarse_run is None
-        self.watch = LoadWatch()
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.coarse_config = study.config("coarse-fewshot")
         self.style_config = study.config("hier-style", style_image=style_image)
@@ -131,11 +125,6 @@ class Workbench:
         """(height, width) of a view."""
         return tuple(self.photos[self.views[0]].shape[:2])
 
-    @property
-    def pixels(self) -> int:
-        """Pixels of a view."""
-        return math.prod(self.size)
-
     def some_rays(self, count: int) -> RayBundle:
         """Rays of random pixels of the held-out views, the same each time."""
         height, width = self.size
@@ -146,12 +135,6 @@ class Workbench:
         rays = cameras.generate_rays(views[:, None].to(self.device), coords.to(self.device))
         rays.camera_indices = torch.zeros_like(rays.camera_indices)
         return rays
-
-    @staticmethod
-    def collect_garbage() -> None:
-        """Gives memory of runs before back; what was there before them needn't be searched, which takes most time."""
-        gc.collect()
-        gc.freeze()
 
     def targets_for(self, config: HierStylePipelineConfig) -> StyleTargets:
         """The painting's features with a run's settings, worked out once."""
@@ -195,10 +178,10 @@ class Workbench:
     def timed(self, work: Callable[[], T]) -> Tuple[float, T]:
         """Seconds of a piece of work, and what it gave."""
         synchronize(self.device)
-        start = self.clock()
+        start = self.budget.clock()
         found = work()
         synchronize(self.device)
-        return self.clock() - start, found
+        return self.budget.clock() - start, found
 
     def train(self, training: Training, iterations: int, budget: Budget, views: Sequence[int] = ()) -> List[float]:
         """Trains up to so many iterations, or until there is no more time than for `evaluate`; seconds of each."""
@@ -210,9 +193,9 @@ class Workbench:
 
     @torch.no_grad()
     def evaluate(self, model: Model, views: Sequence[int]) -> Dict[str, float]:
-        """Means over held-out views; notes what a view takes, and the kept coarse field's error.
+        """Means of PSNR (dB) and SSIM, or of a stylised model's losses by the preset's targets, over held-out views.
 
-        Of a coarse model: PSNR in dB and SSIM. Of a stylised one: style and content loss, by the preset's targets.
+        Notes what a view takes, and the kept coarse field's error.
         """
         model.eval()
         seconds, found = self.timed(lambda: [self._figures(model, view) for view in views])
@@ -243,10 +226,6 @@ class Workbench:
             raise OutOfTimeError
         return self.coarse_model.eval()
 
-    def keep_style(self, model: HierStyleModel) -> None:
-        """Makes a stylised model the one that is rendered."""
-        self.style_model, self.is_stylised = model, True
-
     def model_to_render(self) -> HierStyleModel:
         """The stylised model, or where there is no painting one that only shows the coarse field."""
         if self.style_model is None:
@@ -254,7 +233,7 @@ class Workbench:
             cells, coarse = config.pipeline.model.occupancy_resolution**3, self.coarse_config.pipeline.model
             # Finding the empty cells can't be stopped on the way.
             view_seconds = self.view_seconds.get(CoarseFewShotModel, 0.0)
-            self.budget.check(cells * view_seconds / (self.pixels * coarse.num_eval_samples))
+            self.budget.check(cells * view_seconds / (math.prod(self.size) * coarse.num_eval_samples))
             model = self._setup_pipeline(config).model
             model.adopt_coarse(self.coarse_state)
             self.style_model = model
