@@ -84,8 +84,7 @@ def _faster_one(curve: Curve, preset: Point) -> str:
 
 def _compared(curve: Curve, point: Point, other: Point) -> str:
     """1.9× as fast, 19.00 dB instead of 18.00."""
-    factor = other.median(curve.time) / point.median(curve.time)
-    parts = []
+    factor, parts = other.median(curve.time) / point.median(curve.time), []
     if abs(factor - 1.0) > SMALL_GAIN:
         parts.append(f"{times(factor)} as fast" if factor > 1 else f"{times(1 / factor)} the time")
     if curve.own_error is not None:
@@ -101,9 +100,7 @@ def _compared(curve: Curve, point: Point, other: Point) -> str:
 
 def _remarks(*points: Point) -> str:
     """The end of a line: what makes its figures weak, if anything does."""
-    remarks = []
-    if all(max(map(len, point.values.values())) < 2 for point in points):
-        remarks.append("measured once")
-    if any(point.busy for point in points):
-        remarks.append("the machine was busy")
-    return f" [{'; '.join(remarks)}]" if remarks else "."
+    once = all(max(map(len, point.values.values())) < 2 for point in points)
+    remarks = {"measured once": once, "the machine was busy": any(point.busy for point in points)}
+    said = "; ".join(remark for remark, holds in remarks.items() if holds)
+    return f" [{said}]" if said else "."

@@ -67,11 +67,10 @@ def smooth_along_flow(
     unstylised: Sequence[Float[Tensor, "H W 3"]],
     carried_share: float = CARRIED_SHARE,
 ) -> List[Float[Tensor, "H W 3"]]:
-    """Stylised frames with flicker reduced: each is mixed with the smoothed frame before, carried along the flow.
+    """Stylised frames with flicker reduced: each is mixed with a share, in [0, 1], of the one before, carried along.
 
     The flow is OpenCV's DIS flow (Kroeger et al. 2016) between the unstylised frames. Where going there and back
-    doesn't agree (`is_occluded`) or leaves the picture, the frame stays as it is. `carried_share`, in [0, 1], is the
-    share of the frame before.
+    doesn't agree (`is_occluded`) or leaves the picture, the frame stays as it is.
     """
     smoothed = [stylised[0]]
     for frame, before, now in zip(stylised[1:], unstylised[:-1], unstylised[1:], strict=True):

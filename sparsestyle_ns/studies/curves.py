@@ -134,11 +134,9 @@ class Curve:
     """A curve of error against time for one setting.
 
     Attributes:
-        preset: the setting's value in the preset, as typed after its flag.
         time, error: the metrics between which there is to choose; smaller is better. An error of `psnr` stands for
             the root mean square error with that PSNR.
         plots: (x, y) metrics of each plot; the first is the main one.
-        note: how it was measured.
         own_error: root mean square error of the field against held-out photos. Given, the error is one that only
             saves time and may cost `FREE_LOSS` dB more than need be; None: the knee is recommended.
         left_out: values that weren't measured, and why.
@@ -188,7 +186,7 @@ class Curve:
         return any(point.moment for point in self.points)
 
     def error_of(self, point: Point) -> float:
-        """The error between which and time there is to choose; 0 or more."""
+        """The error, 0 or more, between which and time there is to choose."""
         value = point.median(self.error)
         return root_mean_square(value) if self.error == "psnr" else value
 

@@ -100,9 +100,8 @@ def with_preset(values: Sequence[float], preset: float) -> Tuple[float, ...]:
 def quadrature_plans(bench: Workbench) -> List[Plan]:
     """Samples a ray of the coarse field; and steps, skipping and stopping of stage 2's renders, measured together.
 
-    The last three are looked at in the coarse picture that comes with each stylised one, by the same samples, and share
-    a converged render: what the residual field says of empty cells, which training never visits, means nothing, and a
-    render that skips nothing would show it.
+    The last three are looked at in the coarse picture that comes with each stylised one: what the residual field says
+    of empty cells, which training never visits, means nothing, and a render that skips nothing would show it.
     """
 
     def curve(config: SparseStyleTrainerConfig, setting: str, name: str, title: str) -> Curve:
@@ -158,12 +157,9 @@ def _sweep(
     nothing_skipped: Change,
     budget: Budget,
 ) -> None:
-    """Renders some rays of held-out views in different ways, and compares with a converged render.
+    """Renders some rays of held-out views in different ways, and compares with a converged render, `nothing_skipped`.
 
-    Args:
-        samples: name of the setting that says how many samples a ray has; the first curve is of it.
-        changes: of each curve the values, and what gives the model this value.
-        nothing_skipped: keeps the model from leaving out samples, for the converged render.
+    The first curve's setting is `samples`; `changes` has of each curve the values, and what gives the model this value.
     """
     output = "rgb" if model is bench.coarse_model else "rgb_coarse"
     preset = getattr(model.config, samples)
@@ -295,11 +291,8 @@ def precision_plan(bench: Workbench) -> Plan:
 
 def _measure_precision(bench: Workbench, curve: Curve, budget: Budget) -> None:
     model, device = bench.coarse_to_render(), bench.device
-    has: Dict[Precision, bool] = {
-        "float32": True,
-        "tf32": multiplies_tf32(device),
-        "bfloat16": multiplies_bfloat16(device),
-    }
+    has: Dict[Precision, bool] = {"float32": True}
+    has |= {"tf32": multiplies_tf32(device), "bfloat16": multiplies_bfloat16(device)}
     curve.left_out += [f"{name}: the device has no instructions for it" for name, there in has.items() if not there]
     curve.own_error = bench.own_error
     rays, samples = bench.some_rays(FORMAT_RAYS), model.config.num_eval_samples

@@ -76,10 +76,9 @@ def _svg() -> Iterator[Tuple[Axes, io.StringIO]]:
 
 
 def _draw(cell: Axes, curve: Curve, x: str, y: str) -> None:
-    """Points with the spread of their repetitions, the front, and a ring around the recommended one.
+    """Points with the spread of their repetitions (hollow: busy machine), the front, a ring around the recommended one.
 
-    Hollow points were measured while the machine was busy. Where a number is infinite, a triangle at the top stands for
-    it.
+    A triangle at the top stands for an infinite number.
     """
     points = [point for point in curve.points if x in point.values and y in point.values]
     finite = [point.median(y) for point in points if math.isfinite(point.median(y))] or [0.0, 1.0]

@@ -59,10 +59,7 @@ class PaintingMeasure:
         self._gram: Optional[Tensor] = None
 
     def figures(self, frames: PathFrames, settings: HierStylePipelineConfig) -> Dict[str, float]:
-        """Style strength and content kept, means over every `STYLE_EVERY`th frame, and ArtFID of all of these.
-
-        `settings` of a run's pipeline name network and sizes.
-        """
+        """Means over some frames of style strength and content kept, and their ArtFID; by a run's network and sizes."""
         if self._targets is None:
             settings = replace(settings, style_image=self.painting)
             self._targets = settings.targets_of(settings.load_style(), torch.device("cpu"))

@@ -1,7 +1,6 @@
 """Training the runs that a table needs: each once, resumable, several at a time where the machine has room.
 
-A run's folder carries a digest of everything that decides the outcome, so that a run is found again by what it is: a
-finished one is used as it is, an interrupted one is gone on with.
+A run's folder carries a digest of all that decides the outcome: a finished run is used, an interrupted one goes on.
 """
 
 import hashlib
@@ -17,6 +16,7 @@ from typing import Callable, Dict, List, Mapping, Optional, Sequence, Tuple
 
 import torch
 import yaml
+from nerfstudio.scripts import train
 
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
@@ -24,10 +24,11 @@ from sparsestyle_ns.studies.study import Stage, Study
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.progress import bar, duration, say
-from sparsestyle_ns.utils.progress_file import PROGRESS_FILE, ProgressReport
+from sparsestyle_ns.utils.progress_file import PROGRESS_FILE, ProgressReport, report
 
 SECONDS_FILE = "training_seconds.json"
-TRAINING_PROCESS = (sys.executable, "-m", "sparsestyle_ns.studies.training_process")
+TRAINING_PROCESS = (sys.executable, "-m", "sparsestyle_ns.studies.run_queue")
+"""Followed by a config's file, it trains a run in a process of its own."""
 CORES_PER_JOB = 4
 """CPU cores that a run makes good use of."""
 SECONDS_BETWEEN_LOOKS = 2.0
@@ -152,8 +153,7 @@ class RunQueue:
                 self.say(self.forecast(wanted))
 
         if jobs == 1:  # in this thread, which is the one that Ctrl-C reaches
-            for run in runs:
-                train(run)
+            list(map(train, runs))
             return
         with ThreadPoolExecutor(jobs) as pool:
             try:
@@ -199,11 +199,10 @@ class RunQueue:
         environment = {**os.environ, PROGRESS_FILE: str(progress)}
         if jobs > 1:
             environment["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // jobs))
+        command = [*TRAINING_PROCESS, str(config_path)]
         with (
             log.open("a") as output,
-            subprocess.Popen(
-                [*TRAINING_PROCESS, str(config_path)], stdout=output, stderr=subprocess.STDOUT, env=environment
-            ) as process,
+            subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment) as process,
         ):
             _follow(process, progress, name, total, done)
         if process.returncode != 0 or not run.is_finished:
@@ -228,3 +227,20 @@ def _follow(process: subprocess.Popen, progress: Path, name: str, iterations: in
                 for work in ProgressReport.read(progress).works:
                     if work.unit == "iterations":
                         shown.reach(work.done)
+
+
+def train_run(config: SparseStyleTrainerConfig) -> None:
+    """What ns-train does once it has read its command line; reports why it didn't where it fails."""
+    try:
+        train.main(config)
+    except SystemExit as end:  # so an InputError ends, with its sentence
+        if end.code:
+            report(ProgressReport(failure=str(end.code)))
+        raise
+    except Exception as error:
+        report(ProgressReport(failure=f"{type(error).__name__}: {error}"))
+        raise
+
+
+if __name__ == "__main__":
+    train_run(yaml.load(Path(sys.argv[1]).read_text(encoding="utf-8"), Loader=yaml.Loader))

@@ -1,12 +1,10 @@
 """`sparsestyle tradeoff`: measures all curves within a budget and writes the report, also when it is stopped."""
 
-import contextlib
 import gc
 import tempfile
 import warnings
 from datetime import datetime, timezone
-from pathlib import Path
-from typing import Dict, Iterator, List, Tuple
+from typing import Dict, List, Tuple
 
 import rich
 import torch
@@ -20,7 +18,7 @@ from sparsestyle_ns.studies.measure_training import StageRuns
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.studies.study_options import TradeoffOptions
 from sparsestyle_ns.studies.time_budget import Budget, Plan, parse_duration, run_plans
-from sparsestyle_ns.studies.tradeoff_report import GROUPS, Fact, Report, cant_write
+from sparsestyle_ns.studies.tradeoff_report import GROUPS, Fact, Report, writing_to
 from sparsestyle_ns.studies.workbench import Workbench
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.machine import device_name, versions
@@ -63,9 +61,14 @@ def measure(study: Study, options: TradeoffOptions, budget: Budget) -> Report:
     Raises:
         InputError: the scene, the painting or the coarse run can't be used.
     """
-    check_folder(options.output_dir)
+    with writing_to(options.output_dir):  # known before anything is measured
+        options.output_dir.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=options.output_dir).close()
     seconds, stopped = budget.left, []
-    with quiet(), rich.console.Console().status("Loading the scene") as status:
+    # The lines and warnings of nerfstudio and of the methods stay away from the terminal.
+    quiet = altered(CONSOLE, quiet=True), altered(rich.get_console(), quiet=True)
+    with quiet[0], quiet[1], warnings.catch_warnings(), Console().status("Loading the scene") as status:
+        warnings.simplefilter("ignore")
         bench = Workbench(study, budget, options.style_image, options.coarse_run, options.rounds)
         plans, left_out = all_plans(bench, options)
 
@@ -106,24 +109,6 @@ def all_plans(bench: Workbench, options: TradeoffOptions) -> Tuple[List[Plan], L
     if has_style and of_style:
         plans.append(style.short_plan(of_style))
     return plans, left_out
-
-
-def check_folder(folder: Path) -> None:
-    """Makes the folder of the report before anything is measured; an `InputError` if it can't be written to."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise cant_write(folder, error) from error
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Keeps nerfstudio's and the methods' lines and warnings from the terminal."""
-    with altered(CONSOLE, quiet=True), altered(rich.get_console(), quiet=True), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
 
 
 def facts(bench: Workbench, options: TradeoffOptions, seconds: float) -> Dict[str, Fact]:

@@ -1,5 +1,6 @@
 """The report: JSON, CSV, a page that opens offline, and a picture of all plots."""
 
+import contextlib
 import csv
 import io
 import itertools
@@ -7,7 +8,7 @@ import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Dict, List, Mapping, Optional, Sequence, Union
+from typing import Dict, Iterator, List, Mapping, Optional, Sequence, Union
 
 from sparsestyle_ns.evaluation.tables import Table
 from sparsestyle_ns.studies.advice import recommendation
@@ -19,7 +20,6 @@ from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 
 Fact = Union[str, float, Sequence[str], Mapping[str, str]]
-JSON_FILE, CSV_FILE, PAGE_FILE, PICTURE_FILE = "tradeoff.json", "tradeoff.csv", "index.html", "tradeoff.png"
 GROUPS: Dict[Group, str] = {
     "training": "Training (stage 1)",
     "quadrature": "Quadrature",
@@ -71,22 +71,16 @@ class Report:
         return [*self.left_out, *(f"{curve.title}, {what}" for curve in self.curves for what in curve.left_out)]
 
     def write(self, folder: Path) -> Path:
-        """Writes all files into a folder; returns the page.
-
-        Raises:
-            InputError: it can't be written to.
-        """
+        """Writes all files into a folder and returns the page, or raises an `InputError` if it can't be written to."""
         found = {"recommendation": self.recommendation, "left_out": self.everything_left_out()}
         content = {"scene": self.scene, **self.facts, **found, "axes": list(map(curve_content, self.curves))}
-        try:
-            write_whole(folder / JSON_FILE, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
-            write_whole(folder / CSV_FILE, as_csv(self.curves))
+        with writing_to(folder):
+            write_whole(folder / "tradeoff.json", json.dumps(content, indent=2, ensure_ascii=False) + "\n")
+            write_whole(folder / "tradeoff.csv", as_csv(self.curves))
             if self.measured:
-                write_whole(folder / PICTURE_FILE, overview(self.measured))
+                write_whole(folder / "tradeoff.png", overview(self.measured))
             title = f"What accuracy costs in time: {self.scene}"
-            return write_whole(folder / PAGE_FILE, study_page(title, self.sections()))
-        except OSError as error:
-            raise cant_write(folder, error) from error
+            return write_whole(folder / "index.html", study_page(title, self.sections()))
 
     def sections(self) -> List[Section]:
         """What the page shows."""
@@ -98,9 +92,14 @@ class Report:
         return [Section("In short", lines=self.recommendation), *sections, *left_out, how]
 
 
-def cant_write(folder: Path, error: OSError) -> InputError:
-    """For where a report can't be written."""
-    return InputError(f"The report can't be written to {folder} ({error.strerror}); name another --output-dir.")
+@contextlib.contextmanager
+def writing_to(folder: Path) -> Iterator[None]:
+    """Turns an `OSError` on the way into an `InputError` that names the report's folder."""
+    try:
+        yield
+    except OSError as error:
+        sentence = f"The report can't be written to {folder} ({error.strerror}); name another --output-dir."
+        raise InputError(sentence) from error
 
 
 def as_csv(curves: Sequence[Curve]) -> str:
@@ -141,9 +140,9 @@ def in_a_line(fact: Fact) -> str:
     """A fact in a line."""
     if isinstance(fact, Mapping):
         return ", ".join(f"{name} {item}" for name, item in fact.items())
-    if isinstance(fact, (int, float, str)):
-        return f"{fact:.3g}" if isinstance(fact, float) else str(fact)
-    return ", ".join(map(str, fact))
+    if isinstance(fact, float):
+        return f"{fact:.3g}"
+    return fact if isinstance(fact, str) else ", ".join(fact)
 
 
 def curve_section(curve: Curve) -> Section:
@@ -167,6 +166,5 @@ def _cell(point: Point, metric: str) -> str:
     if metric not in point.values:
         return ""
     spread = point.spread(metric)
-    if spread.count == 1:
-        return f"{spread.median:.4g}"
-    return f"{spread.median:.4g} ({spread.low:.3g} – {spread.high:.3g}, {spread.count}×)"
+    more = f" ({spread.low:.3g} – {spread.high:.3g}, {spread.count}×)" if spread.count > 1 else ""
+    return f"{spread.median:.4g}{more}"
