@@ -202,8 +202,8 @@ class Curve:
     @property
     def recommended(self) -> Optional[Point]:
         """The point to choose, by `rule`."""
-        times, errors = self._times_and_errors
-        index = knee(times, errors) if self.own_error is None else fastest_within(times, errors, self.free_error)
+        both = self._times_and_errors
+        index = knee(*both) if self.own_error is None else fastest_within(*both, self.free_error)
         return None if index is None else self.points[index]
 
     @property

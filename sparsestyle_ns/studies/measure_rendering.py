@@ -91,12 +91,6 @@ def multiples(preset: int) -> Tuple[int, ...]:
     return tuple(sorted({max(2, round(preset * factor)) for factor in FACTORS}))
 
 
-def with_preset(values: Sequence[float], preset: float) -> Tuple[float, ...]:
-    """Values and the preset's, ascending."""
-    near = any(math.isclose(value, preset) for value in values)
-    return tuple(sorted(values if near else (*values, preset)))
-
-
 def quadrature_plans(bench: Workbench) -> List[Plan]:
     """Samples a ray of the coarse field; and steps, skipping and stopping of stage 2's renders, measured together.
 
@@ -129,11 +123,12 @@ def _measure_samples(bench: Workbench, curve: Curve, budget: Budget) -> None:
 def _measure_marching(bench: Workbench, steps: Curve, skipping: Curve, stopping: Curve, budget: Budget) -> None:
     model = bench.model_to_render()
     config = model.config
-    grids = occupancies(model, with_preset(MIN_ALPHAS, float(skipping.preset)), budget)
+    grids = occupancies(model, sorted({*MIN_ALPHAS, config.min_alpha}), budget)
+    transmittances = sorted({*MIN_TRANSMITTANCES, config.min_transmittance})
     changes = {
         steps: _settings(config, "num_steps", multiples(config.num_steps)),
         skipping: {alpha: functools.partial(altered, model, occupancy=grid) for alpha, grid in grids.items()},
-        stopping: _settings(config, "min_transmittance", with_preset(MIN_TRANSMITTANCES, float(stopping.preset))),
+        stopping: _settings(config, "min_transmittance", transmittances),
     }
 
     @contextlib.contextmanager
@@ -251,9 +246,8 @@ def _measure_baking(bench: Workbench, curve: Curve, budget: Budget) -> None:
     def measure_exact(round_: int) -> Mapping[str, Values]:
         if not exact:
             draw(0, None)  # the first takes longer
-        seconds, picture = draw(round_ + 1, None)
-        exact[round_ + 1] = picture
-        return {"": {"view_seconds": seconds, "fps": 1 / seconds, **difference(picture, picture)}}
+        seconds, exact[round_ + 1] = draw(round_ + 1, None)
+        return {"": {"view_seconds": seconds, "fps": 1 / seconds, "rmse": 0.0, "psnr": math.inf}}
 
     def measure_baked(resolution: int, round_: int) -> Mapping[str, Values]:
         found: Dict[str, float] = {}

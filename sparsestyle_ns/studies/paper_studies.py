@@ -1,7 +1,4 @@
-"""The paper's comparison (Tab. 1) and ablations (Sec. 4.2): `sparsestyle compare` and `sparsestyle ablate`.
-
-Which runs are set side by side, and what is shown of them; the commands are at the end.
-"""
+"""`sparsestyle compare` and `ablate`: the runs that the paper sets side by side (Tab. 1, Sec. 4.2), and what is shown."""
 
 import shlex
 from dataclasses import dataclass
@@ -11,7 +8,6 @@ from typing import Dict, List, Mapping, Optional, Sequence, Tuple
 from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.engine.previews import preview_path
-from sparsestyle_ns.evaluation.path_frames import PathFrames
 from sparsestyle_ns.evaluation.tables import COARSE_QUALITY, STYLE_AND_CONTENT, Table, consistency_columns, table_of
 from sparsestyle_ns.metrics.art_fid import why_left_out
 from sparsestyle_ns.runs.scene_record import SceneRecord
@@ -19,9 +15,9 @@ from sparsestyle_ns.studies.baselines import can_transfer, smooth_along_flow, tr
 from sparsestyle_ns.studies.paper_runs import PICTURES, PaperRuns
 from sparsestyle_ns.studies.plots import line_plot
 from sparsestyle_ns.studies.run_figures import (
-    Frames,
     PaintingMeasure,
     RunFigures,
+    Stylise,
     Trace,
     loss_traces,
     measure_coarse,
@@ -183,14 +179,10 @@ ROWS_OF_2D = {
 
 def _measure_2d(folder: Path, measure: PaintingMeasure) -> Dict[str, RunFigures]:
     """The rows of 2D transfer, on the unstylised frames of a run."""
-
-    def frame_by_frame(frames: PathFrames) -> Frames:
-        return transfer_frames(frames.coarse, measure.painting)
-
-    def video(frames: PathFrames) -> Frames:
-        return smooth_along_flow(frame_by_frame(frames), frames.coarse)
-
-    ways = {"frame-by-frame": frame_by_frame, "video": video}
+    ways: Dict[str, Stylise] = {
+        "frame-by-frame": lambda frames: transfer_frames(frames.coarse, measure.painting),
+        "video": lambda frames: smooth_along_flow(transfer_frames(frames.coarse, measure.painting), frames.coarse),
+    }
     return {ROWS_OF_2D[way]: measure_run(folder, measure, way, stylise) for way, stylise in ways.items()}
 
 
@@ -257,18 +249,14 @@ def moving_mean(values: Sequence[float], count: int) -> List[float]:
 
 
 def compare(options: StudyOptions) -> None:
-    """Trains what the comparison needs, and writes its page.
-
-    Raises:
-        InputError: something in the options can't be used, or a run failed.
-    """
+    """Trains what the comparison needs, and writes its page; an `InputError` for bad options or a failed run."""
     runs = check_options(options)
     page = _run_study("Comparison", options, runs, [OF_METHODS], ("ours", "freenerf"))
     finish(page, options.ablate_command())
 
 
 def ablate(options: StudyOptions) -> None:
-    """Trains what the ablations need, and writes their page; errors as of `compare`."""
+    """Trains what the ablations need, and writes their page; an `InputError` for bad options or a failed run."""
     runs = check_options(options)
     kinds = runs.coarse_kinds()
     page = _run_study("Ablations", options, runs, ablations(kinds), kinds)

@@ -31,8 +31,7 @@ FIGURES_FILE = "figures.json"
 STYLE_EVERY = 4
 """Style and content are measured on every fourth frame of the path: neighbours say the same."""
 
-Frames = Sequence[Float[Tensor, "H W 3"]]
-Stylise = Callable[[PathFrames], Frames]
+Stylise = Callable[[PathFrames], Sequence[Float[Tensor, "H W 3"]]]
 """Makes stylised frames of a path's unstylised ones."""
 Trace = Tuple[List[int], List[float]]
 """Iterations, and the values of a loss there."""
@@ -56,19 +55,17 @@ class PaintingMeasure:
     def __init__(self, painting: Path) -> None:
         self.painting = painting
         self._targets: Optional[StyleTargets] = None
-        self._gram: Optional[Tensor] = None
 
     def figures(self, frames: PathFrames, settings: HierStylePipelineConfig) -> Dict[str, float]:
         """Means over some frames of style strength and content kept, and their ArtFID; by a run's network and sizes."""
         if self._targets is None:
             settings = replace(settings, style_image=self.painting)
             self._targets = settings.targets_of(settings.load_style(), torch.device("cpu"))
-            self._gram = gram_matrix(self._targets.style_rows())
-        values, art_fid = [], ArtFID.against(self._targets.style_image)
+        values, art_fid, gram = [], ArtFID.against(self._targets.style_image), gram_matrix(self._targets.style_rows())
         for index in track(range(0, len(frames.stylised), STYLE_EVERY), "Style and content"):
             stylised, coarse = frames.stylised[index], frames.coarse[index]
             covered = frames.surfaces[index].covered.float()
-            figures = stylisation_figures(self._targets, self._gram, coarse, stylised, covered)
+            figures = stylisation_figures(self._targets, gram, coarse, stylised, covered)
             values.append({**figures, "unstylised_ssim": image_metrics(stylised, coarse)["ssim"]})
             if art_fid is not None:
                 art_fid.add(stylised, coarse)
@@ -76,16 +73,12 @@ class PaintingMeasure:
         return means | ({} if art_fid is None else art_fid.figures())
 
 
-def own_frames(frames: PathFrames) -> Frames:
-    """The frames that the run itself has stylised."""
-    return frames.stylised
-
-
-def measure_run(folder: Path, painting: PaintingMeasure, way: str = "", stylise: Stylise = own_frames) -> RunFigures:
+def measure_run(
+    folder: Path, painting: PaintingMeasure, way: str = "", stylise: Optional[Stylise] = None
+) -> RunFigures:
     """What is measured of a stylised run on the measuring path; known figures are read again.
 
-    With the name of a way, and `stylise` for it, of frames stylised so in place of the run's own; they are compared
-    with the run's unstylised frames and its geometry.
+    With the name of a way, and `stylise` for it, of frames stylised so in place of the run's own.
     """
     step = checkpoint_step(newest_checkpoint(folder / "nerfstudio_models"))
     target = folder / (f"measured-{way}" if way else "measured")
@@ -93,7 +86,8 @@ def measure_run(folder: Path, painting: PaintingMeasure, way: str = "", stylise:
     if known is not None:
         return known
     settings, frames = _render(folder, step)
-    frames = replace(frames, stylised=stylise(frames))
+    if stylise is not None:
+        frames = replace(frames, stylised=stylise(frames))
     figures = {**frames.figures(), **painting.figures(frames, settings)}
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir()

@@ -97,10 +97,10 @@ class Case:
 
 
 def in_turns(cases: Sequence[Case], budget: Budget, rounds: int, watch: LoadWatch) -> None:
-    """Measures cases in turn, A B C A B C …, until each has all its rounds or time is over.
+    """Measures cases in turn, A B C A B C …, until each has all its rounds or time is over; slow spells meet all alike.
 
-    So a slow spell of the machine meets all of them. A case that took longer than what is left isn't begun again, nor
-    a new one where the latest other took longer; one that never was is left out, and its curves say so.
+    A case that took longer than what is left isn't begun again, nor a new one where the latest other took longer; one
+    that never was is left out, and its curves say so.
     """
     costs: Dict[int, float] = {}
     latest = 0.0

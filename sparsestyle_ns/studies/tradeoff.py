@@ -44,8 +44,8 @@ def tradeoff(options: TradeoffOptions) -> None:
     if left_out:
         lines += [f"Left out, {len(left_out)}:", *(f"  {line}" for line in left_out)]
     Console().print(*lines, sep="\n", markup=False, highlight=False, soft_wrap=True)
-    method = study.method("coarse-fewshot")
-    finish(page.resolve(), ["ns-train", method, *scene_arguments(study.config("coarse-fewshot"))])
+    config = study.config("coarse-fewshot")
+    finish(page.resolve(), ["ns-train", config.method_name, *scene_arguments(config)])
 
 
 def study_of(options: TradeoffOptions) -> Study:
@@ -56,11 +56,7 @@ def study_of(options: TradeoffOptions) -> Study:
 
 
 def measure(study: Study, options: TradeoffOptions, budget: Budget) -> Report:
-    """Measures what fits into the budget; Ctrl-C ends it, and what has been measured is in the report.
-
-    Raises:
-        InputError: the scene, the painting or the coarse run can't be used.
-    """
+    """Measures what fits into the budget; Ctrl-C ends it, and what has been measured is in the report."""
     with writing_to(options.output_dir):  # known before anything is measured
         options.output_dir.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=options.output_dir).close()

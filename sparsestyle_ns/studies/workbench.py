@@ -25,7 +25,7 @@ from sparsestyle_ns.pipelines.scene_views import SceneViews
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
 from sparsestyle_ns.runs.scene_record import record_scene
 from sparsestyle_ns.studies.curves import Curve, root_mean_square
-from sparsestyle_ns.studies.study import Study, flag_of, get_setting
+from sparsestyle_ns.studies.study import Study, flag_of, get_setting, with_setting
 from sparsestyle_ns.studies.study_options import Group
 from sparsestyle_ns.studies.time_budget import Budget, OutOfTimeError
 from sparsestyle_ns.utils.machine import LoadWatch, synchronize
@@ -67,11 +67,8 @@ def setting_curve(
 class Workbench:
     """The scene, and what has been trained on it so far.
 
-    Args:
-        budget: all the time there is.
-        style_image: the painting; None leaves out what needs one.
-        coarse_run: a coarse run to render; None: the one that is trained here.
-        rounds: repetitions of each measurement at most.
+    Without a painting, what needs one is left out; without a coarse run, the one that is trained here is rendered. Each
+    measurement is repeated for at most so many rounds.
 
     Raises:
         InputError: scene, painting, feature network or coarse run can't be used.
@@ -113,8 +110,7 @@ class Workbench:
     def _adopt_coarse_run(self, folder: Path) -> None:
         run = read_coarse_run(folder)
         check_scene(run, record_scene(self.study.data, self.manager.train_dataparser_outputs, self.effects))
-        config = copy.deepcopy(self.coarse_config)
-        config.pipeline.model = copy.deepcopy(run.config.pipeline.model)
+        config = with_setting(self.coarse_config, "pipeline.model", run.config.pipeline.model)
         model = self._setup_pipeline(config).model
         model.load_state_dict(run.model_state())
         self.keep_coarse(model)
@@ -171,9 +167,8 @@ class Workbench:
 
     def adapted_style_config(self) -> SparseStyleTrainerConfig:
         """Stage 2's preset with the shape of the coarse field that there is."""
-        config = copy.deepcopy(self.style_config)
-        config.pipeline.model.coarse_field = copy.deepcopy(self.coarse_to_render().config.coarse_field)
-        return config
+        field = copy.deepcopy(self.coarse_to_render().config.coarse_field)
+        return with_setting(self.style_config, "pipeline.model.coarse_field", field)
 
     def timed(self, work: Callable[[], T]) -> Tuple[float, T]:
         """Seconds of a piece of work, and what it gave."""
