@@ -1,7 +1,6 @@
-"""A grid that remembers how dense each part of the cube is, so that samples go where something is.
+"""Grids that remember what each part of the cube holds, so that samples go where something is.
 
-In stage 1 it follows the field as it learns: a ray's samples are placed by the weights that the remembered densities
-give. Once the coarse field is frozen, it says which cells are empty.
+In stage 1 one follows the field as it learns; once the coarse field is frozen, one says which cells are empty.
 """
 
 from typing import Callable, NamedTuple, Optional
@@ -45,7 +44,7 @@ class DensityGrid(nn.Module):
         self.register_buffer("density", torch.full((resolution**3,), initial))
 
     def cells(self, positions: Float[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
-        """The cell each position lies in; positions outside the cube belong to the nearest cell."""
+        """The cell each position lies in."""
         index = grid_cells(positions, self.resolution)
         return (index[..., 0] * self.resolution + index[..., 1]) * self.resolution + index[..., 2]
 
@@ -53,13 +52,11 @@ class DensityGrid(nn.Module):
     def remember(
         self, positions: Float[Tensor, "*batch 3"], density: Float[Tensor, "*batch"], decay: float = 0.8
     ) -> None:
-        """Takes note of densities seen at positions: the larger of them and `decay` times what the cell had.
-
-        A density that isn't finite is no news: the step it comes from is skipped, but what the grid holds would stay.
-        """
+        """Takes note of densities seen at positions: the larger of them and `decay` times what the cell had."""
         cells = self.cells(positions).reshape(-1)
         seen = density.detach().reshape(-1).to(self.density)
         self.density[cells] *= decay
+        # The step that a density which isn't finite comes from is skipped, but what the grid holds would stay.
         self.density.scatter_reduce_(0, cells, seen.where(seen.isfinite(), 0.0), reduce="amax")
 
     @torch.no_grad()
@@ -74,12 +71,9 @@ class DensityGrid(nn.Module):
     ) -> Float[Tensor, "rays edges"]:
         """Borders of `num_samples` samples on each ray, dense where the remembered density is seen from the camera.
 
-        The histogram is what volume rendering of the remembered densities on `num_bins` even bins gives, each bin
-        widened to its neighbours, plus an even share so that no part of a ray is forgotten.
-
-        Args:
-            even_share: part of the mass in (0, 1] that is spread evenly.
-            generator: moves borders at random; None gives a fixed placement.
+        They follow a histogram of the remembered densities' weights on `num_bins` even bins, each widened to its
+        neighbours. `even_share` of its mass, in (0, 1], is spread evenly, so that no part of a ray is forgotten; a
+        `generator` moves borders at random.
         """
         rays = len(segments.hit)
         edges = even_edges(rays, num_bins, self.density.device, generator)
@@ -117,15 +111,14 @@ class Occupancy(nn.Module):
         side = 2.0 / self.resolution
         axis = (torch.arange(self.resolution, device=self.occupied.device) + 0.5) * side - 1.0
         alphas = []
-        layers = max(1, chunk // self.resolution**2)
-        for xs in axis.split(layers):
+        for xs in axis.split(max(1, chunk // self.resolution**2)):
             points = torch.stack(torch.meshgrid(xs, axis, axis, indexing="ij"), dim=-1)
             alphas.append(-torch.expm1(-density(points.reshape(-1, 3)) * side).view(points.shape[:-1]))
-        occupied = (torch.cat(alphas) > min_alpha).to(torch.uint8)
-        self.occupied.copy_(F.max_pool3d(occupied.float()[None], kernel_size=3, stride=1, padding=1)[0] > 0)
+        occupied = (torch.cat(alphas) > min_alpha).float()
+        self.occupied.copy_(F.max_pool3d(occupied[None], kernel_size=3, stride=1, padding=1)[0] > 0)
 
     def contains(self, positions: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
-        """Whether positions lie in occupied cells; positions outside the cube belong to the nearest cell."""
+        """Whether positions lie in occupied cells."""
         index = grid_cells(positions, self.resolution)
         return self.occupied[index[..., 0], index[..., 1], index[..., 2]]
 

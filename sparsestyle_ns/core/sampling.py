@@ -34,12 +34,8 @@ def sample_pdf(
 ) -> Float[Tensor, "rays edges"]:
     """`num_samples` + 1 borders that cut a histogram into parts of equal mass (NeRF, Sec. 5.2, by inverse CDF).
 
-    The first border is the histogram's start and the last its end, so that the samples cover the whole ray.
-
-    Args:
-        edges: ascending borders of the histogram's bins.
-        weights: mass of each bin, ≥ 0, with a positive sum on every ray.
-        generator: moves inner borders by up to half a part of mass.
+    The first border is the histogram's start and the last its end. Weights, the mass of each bin between its ascending
+    `edges`, are ≥ 0, with a positive sum on every ray; a `generator` moves inner borders by up to half a part of mass.
     """
     mass = torch.cumsum(weights, dim=-1)
     cdf = torch.cat([torch.zeros_like(mass[:, :1]), mass / mass[:, -1:]], dim=-1)

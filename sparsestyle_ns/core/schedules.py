@@ -8,14 +8,13 @@ from sparsestyle_ns.utils.errors import InputError
 def content_weight(step: int, initial: float, decay: float, duration: int) -> float:
     """The weight λ of the content loss at one iteration (Eq. 6).
 
-    λ(t) = λ0 · α^(t/T) while t ≤ T, and λ0 · α from then on: an exponential fall from λ0 to λ0 · α. With T = 0
-    the fall is already over, so λ is λ0 · α from the first iteration on, t = 0 included.
+    λ(t) = λ0 · α^(t/T) while t ≤ T, and λ0 · α from then on; with T = 0 from the first iteration on.
 
     Args:
         step: the iteration t, counted from 0.
-        initial: λ0 ≥ 0, the weight at t = 0; the paper's is 10.
-        decay: α ≥ 0, what is left of the weight at the end; the paper's is 0.01, 1 keeps the weight constant.
-        duration: T ≥ 0, the iterations the fall takes; the paper's is 100.
+        initial: λ0 ≥ 0; the paper's is 10.
+        decay: α ≥ 0; the paper's is 0.01, 1 keeps the weight constant.
+        duration: T ≥ 0 iterations; the paper's is 100.
 
     Raises:
         InputError: an argument is negative, infinite or not a number.
@@ -28,19 +27,13 @@ def content_weight(step: int, initial: float, decay: float, duration: int) -> fl
     for name, value in arguments.items():
         if not 0 <= value < math.inf:
             raise InputError(f"The content weight's {name} is {value}: give a finite number that is 0 or more.")
-    if step >= duration:
-        return initial * decay
-    return initial * decay ** (step / duration)
+    return initial * decay ** (step / duration if step < duration else 1)
 
 
 def ramp(progress: float, start: float, length: float) -> float:
     """A share that rises evenly from 0 at `start` to 1 at `start + length`; a step where `length` is 0.
 
-    All three are shares of the iterations, 0 or more.
-
-    Example:
-        >>> ramp(0.5, start=0.25, length=0.5)
-        0.5
+    All three are shares of the iterations, 0 or more: `ramp(0.5, start=0.25, length=0.5)` is 0.5.
     """
     since = progress - start
     if since >= length:

@@ -1,7 +1,5 @@
 """Which part of space a scene lies in, and how it is laid into the cube [−1, 1]³ that the fields live in.
 
-Three spaces cover the scenes that nerfstudio's dataparsers give: *forward-facing* (NDC: everything from a near plane to
-infinity), *box* (an object in an axis-aligned box) and *contracted* (cameras all around, background at any distance).
 A space turns rays into segments; s in [0, 1] goes from a segment's start to its end. Density is per unit of length in
 the cube, so that the scale of the world's coordinates doesn't matter.
 """
@@ -102,10 +100,7 @@ class _BoxSegments(LinearSegments):
 
 @dataclass
 class ContractedSegments(Segments):
-    """Segments of world rays, bent by the contraction; s is linear up to distance 1 and in disparity beyond.
-
-    Origins and `near` are in multiples of `unit`, a length in the world.
-    """
+    """Segments of world rays, bent by the contraction; origins and `near` are in multiples of `unit`, a world length."""
 
     origins: Float[Tensor, "rays 3"]
     directions: Float[Tensor, "rays 3"]
@@ -118,16 +113,15 @@ class ContractedSegments(Segments):
         return self.unit * self._distance_in_units(s)
 
     def _distance_in_units(self, s: Tensor) -> Tensor:
-        start, end = self._ends
-        return inverse_spacing(start.to(s) + s * (end - start).to(s))
+        start, end = self._ends(s)
+        return inverse_spacing(start + s * (end - start))
 
-    @property
-    def _ends(self) -> Tuple[Tensor, Tensor]:
-        return spacing(torch.tensor(self.near)), spacing(torch.tensor(MAX_DISTANCE))
+    def _ends(self, like: Tensor) -> Tuple[Tensor, Tensor]:
+        return spacing(like.new_tensor(self.near)), spacing(like.new_tensor(MAX_DISTANCE))
 
     def at_distance(self, distance: Tensor) -> Tensor:
         """See `Segments.at_distance`."""
-        return _position_between(spacing(distance / self.unit), *(end.to(distance) for end in self._ends))
+        return _position_between(spacing(distance / self.unit), *self._ends(distance))
 
     def positions(self, s: Tensor, ray_indices: Optional[Tensor] = None) -> Tensor:
         """See `Segments.positions`."""
@@ -165,7 +159,7 @@ def inverse_spacing(spaced: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 def contract(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Points into [−1, 1]³: x/2 within the unit cube, (1 − 1/(2|x|)) x/|x| outside, |·| the largest coordinate.
 
-    It is the contraction of mip-NeRF 360 (Eq. 10) with the maximum norm, halved.
+    The contraction of mip-NeRF 360 (Eq. 10) with the maximum norm, halved.
     """
     norm = points.abs().amax(dim=-1, keepdim=True).clamp(min=1.0)
     # Equal to x/2 at norm 1, and so everywhere within the cube. x/|x| comes first: the largest x has no double.
@@ -181,8 +175,7 @@ def intersect_box(
 ) -> Tuple[Float[Tensor, "rays 1"], Float[Tensor, "rays 1"], Bool[Tensor, "rays"]]:
     """Distances at which rays enter and leave an axis-aligned box, and whether they meet it (the slab method).
 
-    Rays start no closer than `near`, so that a camera may stand in the box. Where they miss it, both distances are
-    `near`.
+    Rays start no closer than `near`; where they miss the box, both distances are `near`.
     """
     tiny = torch.finfo(directions.dtype).tiny
     safe = torch.where(directions.abs() < tiny, torch.full_like(directions, tiny), directions)
@@ -208,14 +201,14 @@ class ForwardFacingSpace(Space):
     """Normalised device coordinates (NeRF, appendix C), for cameras that all look one way.
 
     Depth d lies at z' = 1 − 2 near/d. Samples lie between the two depths of `depth_range`; the last one's interval goes
-    on to infinity. Knowing how far away the farthest thing is matters with few photos: all that lies at infinity looks
-    the same from everywhere, so that a field which puts a whole photo there is hard to dislodge.
+    on to infinity. What lies at infinity looks the same from everywhere: with few photos, a field that puts a whole
+    photo there is hard to dislodge.
 
     Args:
         box: NDC box that holds all views' frusta; between the depths it becomes the cube.
         focal_over_half_size: 2f/width and 2f/height.
         near: distance of the near plane in world units.
-        depth_range: depth of the nearest and of the farthest thing, in world units; None for all from `near` on.
+        depth_range: depths of the nearest and the farthest thing, in world units; None for all from `near` on.
     """
 
     unbounded = True
@@ -246,16 +239,9 @@ class ForwardFacingSpace(Space):
         hit = (valid & (first < last)).squeeze(-1)
         size = self.maximum - self.minimum
         scale = 2.0 / torch.where(size > 0, size, 2.0)
-        return _ForwardFacingSegments(
-            start=(start + first * extent - self.minimum) * scale - 1.0,
-            extent=(last - first) * extent * scale * hit[:, None],
-            hit=hit,
-            origins=origins,
-            directions=directions,
-            near=self.near,
-            first=first,
-            last=last,
-        )
+        start = (start + first * extent - self.minimum) * scale - 1.0
+        extent = (last - first) * extent * scale * hit[:, None]
+        return _ForwardFacingSegments(start, extent, hit, origins, directions, self.near, first, last)
 
 
 class BoxSpace(Space):
@@ -278,14 +264,9 @@ class BoxSpace(Space):
         size = self.maximum - self.minimum
         scale = 2.0 / size.amax()
         near, far, hit = intersect_box(origins, directions, self.minimum, self.maximum, self.near / scale)
-        return _BoxSegments(
-            start=(origins + near * directions - center) * scale,
-            extent=(far - near) * directions * scale,
-            hit=hit,
-            near=near,
-            far=far,
-            beyond=(origins - center).norm(dim=-1, keepdim=True) + 0.5 * size.norm(),
-        )
+        start = (origins + near * directions - center) * scale
+        beyond = (origins - center).norm(dim=-1, keepdim=True) + 0.5 * size.norm()
+        return _BoxSegments(start, (far - near) * directions * scale, hit, near, far, beyond)
 
 
 class ContractedSpace(Space):

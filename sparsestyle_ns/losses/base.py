@@ -24,7 +24,7 @@ class StylizedView:
     features: Float[Tensor, "rows C"]
     """Of the picture, where the scene covers it; differentiable."""
     content: Float[Tensor, "rows C"]
-    """Those of the content picture, row for row."""
+    """Those of the content picture."""
 
 
 class StylizationLoss(ABC):

@@ -32,14 +32,11 @@ class StyleIndex:
         cos(f, s) ≤ a(f) · a(s) + p(f) p(s) = (a(f), p(f)) · (a(s), p(s)),
 
     a product of k + 1 instead of C numbers. In the style's own principal directions it is tight: with k = 23 of the
-    768 channels of VGG's third block about 3% of a painting's vectors can't be ruled out. They lie together, as the
-    vectors are sorted into blocks of similar ones, so each block is compared with those features, in one matrix
-    product, for which its largest bound reaches the best similarity found so far. That product is the plain search's,
-    and what was ruled out could not have won: the answer is the plain search's as well.
+    768 channels of VGG's third block about 3% of a painting's vectors can't be ruled out. Vectors are sorted into
+    blocks of similar ones; a block is compared, in one product of whole vectors, with those features for which its
+    largest bound reaches the best similarity so far. What is ruled out could not have won, so the answer is exact.
 
-    Args:
-        style_features: one vector a row, M ≥ 1. The index holds a copy of their directions.
-        block_size: most vectors in a block, 1 or more; None: as `BLOCK_SIZES` says. It changes time, not the answer.
+    `block_size`, the most vectors in a block, changes time, not the answer; None: as `BLOCK_SIZES` says.
 
     Raises:
         ValueError: there are no style features.
@@ -68,7 +65,7 @@ class StyleIndex:
         self._places = places[first]
 
     def directions_of(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N C"]:
-        """Style vectors in these rows of `style_features`, of length 1 or, where they have no direction, 0."""
+        """Style vectors in these rows, as `unit_vectors`."""
         return self.blocks.flatten(0, 1)[self._places[rows]]
 
     @torch.no_grad()
@@ -117,8 +114,7 @@ class _Matches:
     """The best similarity of each feature vector so far, and all pairs that were compared."""
 
     def __init__(self, directions: Float[Tensor, "n C"], blocks: Float[Tensor, "blocks size C"]) -> None:
-        self.directions = directions
-        self.blocks = blocks
+        self.directions, self.blocks = directions, blocks
         self.best = directions.new_full((len(directions),), -torch.inf)
         self._compared: List[Tuple[Tensor, Tensor, Tensor, Tensor]] = []
 
@@ -158,8 +154,7 @@ def _first_equal(rows: Float[Tensor, "M C"]) -> Int[Tensor, " M"]:
 
 
 def _principal_axes(directions: Float[Tensor, "M C"]) -> Float[Tensor, "C C"]:
-    """Orthonormal columns, those first in which the vectors are longest."""
-    # Any orthonormal columns bound similarities; a sample gives bounds as good as all.
+    """Orthonormal columns, those first in which the vectors are longest, as a sample of them says."""
     sample = directions[:: -(-len(directions) // BASIS_SAMPLE)].double()
     _, axes = torch.linalg.eigh(sample.T @ sample)
     return axes.flip(1).to(directions.dtype)
@@ -184,8 +179,7 @@ def _outline(directions: Float[Tensor, "N C"], basis: Float[Tensor, "C k"]) -> F
 def _similar_blocks(points: Float[Tensor, "M k"], block_size: int) -> Int[Tensor, "blocks size"]:
     """Rows of `points` in blocks of at most this many, similar ones together, each block's in ascending order.
 
-    All points are halved at the median of the coordinate that varies most, then each half, and so on (a k-d tree).
-    Where they can't be shared out evenly, the last occurs more than once.
+    The leaves of a k-d tree; where points can't be shared out evenly, the last occurs more than once.
     """
     depth = (-(-len(points) // block_size) - 1).bit_length()
     leaf_size = -(-len(points) // 2**depth)

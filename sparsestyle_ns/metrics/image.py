@@ -1,7 +1,6 @@
 """How like a photo a picture is: PSNR, SSIM, LPIPS where its weights are on the machine, and ST-LPIPS.
 
-ST-LPIPS (Ghildyal and Liu 2022) is LPIPS with a network that isn't moved by tiny shifts. Its AlexNet and the linear
-heads come with the package stlpips-pytorch, of which only the weight file is read. Its numbers are not LPIPS's.
+ST-LPIPS (Ghildyal and Liu 2022) is LPIPS with a network that isn't moved by tiny shifts; its numbers are not LPIPS's.
 """
 
 import functools
@@ -26,10 +25,8 @@ SHIFT_TOLERANT_LAYERS = (
     ("net.slice5.13", None),
 )
 """Each layer's convolution and blur in the weight file."""
-MIN_LPIPS_SIDE = 31
-"""Pixels a side below which nothing is left of a picture for LPIPS' last layers."""
-MIN_SHIFT_TOLERANT_SIDE = 24
-"""Pixels a side below which nothing is left of a picture for ST-LPIPS' last layers."""
+MIN_LPIPS_SIDE, MIN_SHIFT_TOLERANT_SIDE = 31, 24
+"""Pixels a side below which nothing is left of a picture for the last layers."""
 
 
 def psnr(image: Float[Tensor, "H W 3"], reference: Float[Tensor, "H W 3"]) -> float:
@@ -56,19 +53,15 @@ def _load_lpips(weights: Path) -> Metric:
 
 
 def lpips_metric(size: Tuple[int, ...]) -> Optional[Metric]:
-    """LPIPS with AlexNet for pictures of a height and width, on the CPU.
-
-    None where these are too small, or the network's weights are not in the torch hub cache. torchmetrics would download
-    them; measuring a picture must not depend on a network.
-    """
+    """LPIPS with AlexNet for pictures of a height and width, on the CPU; None for tiny ones or without its weights."""
+    # torchmetrics would download the weights; measuring a picture must not depend on a network.
     return _load_lpips(hub_file(ALEXNET_FILE)) if has_lpips() and min(size) >= MIN_LPIPS_SIDE else None
 
 
 class ShiftTolerantLPIPS:
-    """ST-LPIPS with AlexNet: the distance of two pictures in the features of five layers.
+    """ST-LPIPS with AlexNet: squared differences of unit feature vectors of five layers, weighted by channel.
 
-    Each layer's feature vectors are scaled to length 1; their squared differences, weighted by channel, are averaged
-    over the picture and summed over the layers (Zhang et al. 2018, Eq. 1). `state` is the weight file's content.
+    Averaged over the picture and summed over the layers (Zhang et al. 2018, Eq. 1). `state` is the weight file's.
     """
 
     def __init__(self, state: Dict[str, Tensor]) -> None:
@@ -109,7 +102,7 @@ def _load_st_lpips() -> Optional[Metric]:
 
 
 def st_lpips_metric(size: Tuple[int, ...]) -> Optional[Metric]:
-    """ST-LPIPS for pictures of a height and width, on the CPU; None where its weights are gone or these too small."""
+    """ST-LPIPS for pictures of a height and width, on the CPU; None where these are too small or its weights gone."""
     return _load_st_lpips() if min(size) >= MIN_SHIFT_TOLERANT_SIDE else None
 
 

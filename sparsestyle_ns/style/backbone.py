@@ -41,11 +41,7 @@ class Weights:
 
     def describe(self, name: str) -> BackboneDescription:
         """The description of the network `name` with these weights."""
-        with self.path.open("rb") as file:
-            digest = hashlib.sha256()
-            while chunk := file.read(1 << 20):
-                digest.update(chunk)
-        return BackboneDescription(name, self.source, digest.hexdigest())
+        return BackboneDescription(name, self.source, hashlib.sha256(self.path.read_bytes()).hexdigest())
 
 
 class Backbone(nn.Module, ABC):
@@ -82,11 +78,7 @@ class Backbone(nn.Module, ABC):
     @classmethod
     @abstractmethod
     def load(cls, weights: Weights, state: Dict[str, Any]) -> "Backbone":
-        """The network with these weights, on the CPU, in evaluation mode and without gradients of its own.
-
-        Raises:
-            InputError: the state isn't one of this network.
-        """
+        """The network, on the CPU, frozen and in evaluation mode; an `InputError` where the state isn't one of it."""
 
     @abstractmethod
     def forward(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B C h w"]:

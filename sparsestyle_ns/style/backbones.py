@@ -1,7 +1,4 @@
-"""All feature networks, and the one that a run gets.
-
-A new one is a class (`style.backbone.Backbone`) and its line in `BACKBONES`.
-"""
+"""All feature networks, and the one that a run gets. A new one is a `Backbone` and its line in `BACKBONES`."""
 
 from pathlib import Path
 from typing import Dict, Literal, Optional, Type
@@ -21,8 +18,7 @@ def load_backbone(name: str = "auto", weights: Optional[Path] = None) -> Backbon
 
     Args:
         name: a key of `BACKBONES`, or `auto`: the network that `weights` is of, else the first that has weights here.
-        weights: a weight file; for the networks known so far a state dict of torchvision's VGG-16 or of ST-LPIPS' VGG,
-            in which layers after relu3_3 may be missing.
+        weights: a weight file, such as a state dict of torchvision's VGG-16; layers after relu3_3 may be missing.
 
     Raises:
         InputError: there are no weights to be had, or the file is not of the network asked for.
@@ -41,7 +37,7 @@ def load_backbone(name: str = "auto", weights: Optional[Path] = None) -> Backbon
 
 
 def available_backbone() -> Optional[str]:
-    """The name of the network that `load_backbone()` gives; None where no weights are found or can be downloaded."""
+    """The name of the network that `load_backbone()` gives; None where it would find no weights."""
     return next((kind.name for kind in BACKBONES.values() if kind.find_weights() is not None), None)
 
 

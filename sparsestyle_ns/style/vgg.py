@@ -1,10 +1,7 @@
-"""VGG-16 features of block 3, and where their weights come from on a machine without a network.
+"""VGG-16 features of block 3, by either of two networks with the same convolutions.
 
-Two networks with the same convolutions are known:
-
-- `vgg16`: VGG-16 as torchvision has it, with 2×2 max pooling of stride 2;
-- `vgg16-shift-tolerant`: the trunk of ST-LPIPS, in which max pooling has stride 1 and a 3×3 binomial blur of stride 2
-  follows, after reflecting two pixels over each border. Its maps have one row and one column more: H ↦ ⌊H/2⌋ + 1.
+`vgg16` is torchvision's, with 2×2 max pooling of stride 2. In `vgg16-shift-tolerant`, ST-LPIPS' trunk, max pooling has
+stride 1 and a 3×3 binomial blur of stride 2 follows, with two pixels reflected over each border: H ↦ ⌊H/2⌋ + 1.
 """
 
 import http.client
@@ -37,7 +34,6 @@ PLAIN_CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
 
 CONVOLUTIONS = ("blocks.0.0", "blocks.0.1", "blocks.1.0", "blocks.1.1", "blocks.2.0", "blocks.2.1", "blocks.2.2")
 POOLS = ("pools.0", "pools.1")
-"""Those layers of a `VGGBlock3` that may have weights."""
 
 
 class BlurPool(nn.Module):
@@ -48,17 +44,13 @@ class BlurPool(nn.Module):
         self.register_buffer("filt", torch.empty(channels, 1, 3, 3))
 
     def forward(self, maps: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C h w"]:
-        """Each channel pooled and blurred, h = ⌊H/2⌋ + 1 rows and w = ⌊W/2⌋ + 1 columns."""
-        peaks = F.max_pool2d(maps, kernel_size=2, stride=1)
-        padded = F.pad(peaks, (2, 2, 2, 2), mode="reflect")
+        """Each channel pooled and blurred, h = ⌊H/2⌋ + 1 and w = ⌊W/2⌋ + 1."""
+        padded = F.pad(F.max_pool2d(maps, kernel_size=2, stride=1), (2, 2, 2, 2), mode="reflect")
         return F.conv2d(padded, self.filt, stride=2, groups=self.filt.shape[0])
 
 
 class VGGBlock3(Backbone):
-    """relu3_1, relu3_2 and relu3_3 of VGG-16, joined in this order; what both networks have in common.
-
-    Built without storage: weights are given to it, and torch's random state stays untouched.
-    """
+    """relu3_1, relu3_2 and relu3_3 of VGG-16, joined in this order; what both networks have in common."""
 
     channels = sum(BLOCK_CHANNELS[-1][1:])
     smallest_side = 8
@@ -69,7 +61,7 @@ class VGGBlock3(Backbone):
     def __init__(self, description: BackboneDescription) -> None:
         super().__init__()
         self.description = description
-        with torch.device("meta"):
+        with torch.device("meta"):  # weights are given to it, and torch's random state stays untouched
             self.blocks = nn.ModuleList(
                 nn.ModuleList(nn.Conv2d(*pair, kernel_size=3, padding=1) for pair in itertools.pairwise(channels))
                 for channels in BLOCK_CHANNELS
@@ -174,7 +166,7 @@ class ShiftTolerantVGG16(VGGBlock3):
 
 
 def _refuse_relatives(state: Dict[str, Any]) -> None:
-    """Raises a `ValueError` for VGG-19, say, which has the same shapes up to relu3_3, but other weights."""
+    """Raises a `ValueError` for VGG-19, say, whose shapes up to relu3_3 are the same."""
     for key in map(str, state):
         network, layer, *_ = [*key.split("."), ""]
         if network == "features" and not (layer.isdigit() and int(layer) in PLAIN_CONVOLUTIONS):
@@ -182,7 +174,7 @@ def _refuse_relatives(state: Dict[str, Any]) -> None:
 
 
 def _download(target: Path) -> bool:
-    """Whether torchvision's VGG-16 could be fetched. The bar of this half gigabyte is shown on a terminal only."""
+    """Whether torchvision's VGG-16, half a gigabyte, could be fetched."""
     before = socket.getdefaulttimeout()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

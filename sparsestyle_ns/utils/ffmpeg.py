@@ -1,4 +1,4 @@
-"""An ffmpeg for `ns-render` on machines that have none installed."""
+"""An ffmpeg for `ns-render`, which doesn't start without one, on machines that have none installed."""
 
 import atexit
 import os
@@ -12,10 +12,7 @@ from sparsestyle_ns.utils.errors import InputError
 
 
 def put_ffmpeg_on_path() -> None:
-    """Puts the ffmpeg that the package imageio-ffmpeg carries on this process's PATH, if there is no other.
-
-    `ns-render` refuses to start without an `ffmpeg` there, whatever it is to write; an `InputError` if neither exists.
-    """
+    """Puts imageio-ffmpeg's ffmpeg on this process's PATH, if there is no other; an `InputError` if neither exists."""
     if shutil.which("ffmpeg") is not None:
         return
     try:

@@ -70,10 +70,9 @@ def others_share(earlier: Tuple[float, float], later: Tuple[float, float]) -> fl
 
 
 class LoadWatch:
-    """Says of each of many measurements whether other processes kept the machine busy meanwhile.
+    """Says of the latest `with` that it was around whether other processes kept the machine `busy` meanwhile.
 
-    Use it as a context manager around each; `busy` then is the answer for the latest. A measurement shorter than
-    `SHORTEST_WINDOW` is judged together with what came right before it.
+    One shorter than `SHORTEST_WINDOW` is judged together with what came right before it.
     """
 
     def __init__(self) -> None:

@@ -18,10 +18,9 @@ R = TypeVar("R")
 
 
 def kernel(function: Callable[..., None]) -> Callable[..., None]:
-    """Compiles a function of arrays and numbers on its first call; the result is kept on disk for later processes.
+    """Compiles a function of arrays and numbers on its first call, for later processes too; it runs without the GIL.
 
-    The function gives its results in arrays, must stay inside their bounds (nothing checks), and runs without Python's
-    lock. Products and sums may be contracted to fused ones.
+    It gives its results in arrays, and must stay inside their bounds: nothing checks.
     """
     options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
     try:
@@ -31,10 +30,7 @@ def kernel(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def run_on_threads(function: Callable[..., None], parts: Sequence[Tuple]) -> None:
-    """Calls `function(*part)` for each part, on as many threads as torch uses.
-
-    Parts must not write to the same places. An error in one is raised here.
-    """
+    """Calls `function(*part)` for each part, on as many threads as torch uses; an error in one is raised here."""
     threads = min(torch.get_num_threads(), len(parts))
     # Python's end has begun where the main thread is over, and then no pool takes work any more.
     if threads <= 1 or not threading.main_thread().is_alive():
@@ -53,10 +49,9 @@ def even_parts(length: int, count: int) -> Sequence[Tuple[int, int]]:
 
 
 def untraced(function: Callable[P, R]) -> Callable[P, R]:
-    """Has `function` run without the thread's trace function, which is back in place afterwards.
+    """Has `function` run without the thread's trace function, by which the viewer breaks a picture off.
 
-    The viewer breaks a picture off by an exception that its trace function raises between any two lines of Python.
-    Inside of a lock's own code, such as that of numba's compiler, that would leave the lock taken for good.
+    Its exception, inside of a lock's own code such as that of numba's compiler, would leave the lock taken for good.
     """
 
     @functools.wraps(function)

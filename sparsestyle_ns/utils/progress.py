@@ -2,36 +2,77 @@
 
 All bars of a process are on one display, also those of several threads and bars within bars, and what is printed
 meanwhile appears above them. Of several processes that train together, the first shows them; where CONSOLE is quiet,
-nothing is shown. A process that was started by another one tells it how far it is in a file (see `progress_file`).
+nothing is shown. A process that was started by another one tells it how far it is in a small JSON file, which is
+replaced as a whole, so that a reader finds one that is complete or none.
 """
 
+import json
 import math
+import os
 import threading
 import time
-from contextlib import contextmanager
-from typing import Iterator, Optional, Sequence, TypeVar
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Iterator, Optional, Sequence, Tuple, TypeVar
 
 from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
-from sparsestyle_ns.utils.progress_file import ProgressReport, Work, report
-
 T = TypeVar("T")
 
+PROGRESS_FILE = "SPARSESTYLE_PROGRESS_FILE"
+"""Environment variable with that file's path; where it isn't set, nothing is written."""
 SECONDS_BETWEEN_LINES = (10.0, 60.0)
 """In a log, the least and the most time from one line to the next."""
 SHARE_BETWEEN_LINES = 0.05
 """Share of the work after which a line comes before the most time has passed."""
 WORTH_A_LINE = 10.0
 """Seconds from which on finished work leaves a line that says how long it took."""
-SPEED_PERIOD = 120.0
-"""Seconds of the past by which the time left is estimated."""
-REFRESHES = 4
-"""Of the bars in a second; drawing them takes time from the work."""
 SECONDS_BETWEEN_REPORTS = 1.0
-"""Least time from one report to the process that started this one to the next."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """A piece of work that is under way; `unit` is what is counted, `iterations` for training itself."""
+
+    description: str
+    done: float
+    total: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class ProgressReport:
+    """What a process says of its work: what is under way, the outermost first."""
+
+    works: Tuple[Work, ...] = ()
+    failure: str = ""
+    """Why the process ended without finishing, one sentence; empty while all is well."""
+
+    def write(self, path: Path) -> None:
+        """Replaces the file, or raises an `OSError`."""
+        unfinished = path.with_name(path.name + ".unfinished")
+        unfinished.write_text(json.dumps(asdict(self)), encoding="utf-8")
+        os.replace(unfinished, path)  # without waiting for the disk: nobody reads it after a crash of the machine
+
+    @classmethod
+    def read(cls, path: Path) -> "ProgressReport":
+        """The newest report; an empty one before the first."""
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return cls()
+        return cls(tuple(Work(**work) for work in content["works"]), content["failure"])
+
+
+def report(content: ProgressReport) -> None:
+    """Writes a report, where this process is to write one; work doesn't stop because it can't be written."""
+    if os.environ.get(PROGRESS_FILE):
+        with suppress(OSError):
+            content.write(Path(os.environ[PROGRESS_FILE]))
 
 
 class Bar:
@@ -74,7 +115,7 @@ class Bar:
 def bar(description: str, total: float, done: float = 0, unit: str = "", visible: bool = True) -> Iterator[Bar]:
     """Shows how far some work is, within a `with`; nothing is shown where there is one thing to do in all.
 
-    The description is a word or two, `done` what was done before, and `unit` what is counted, for lines in a log.
+    `done` was done before, and `unit` is what is counted, for lines in a log.
     """
     with _shared_display() as display:
         number = display.add_task(
@@ -157,8 +198,8 @@ def _shared_display() -> Iterator[Progress]:
                 TextColumn("{task.fields[note]}", markup=False, style="dim"),
                 console=CONSOLE,
                 transient=True,
-                refresh_per_second=REFRESHES,
-                speed_estimate_period=SPEED_PERIOD,
+                refresh_per_second=4,
+                speed_estimate_period=120.0,
                 disable=not (can_draw and comms.is_main_process()),
             )
             _display.start()

@@ -23,7 +23,7 @@ class Skipped(NamedTuple):
 def broken(parameters: Iterable[nn.Parameter]) -> Float[Tensor, ""]:
     """1 where the squares of all gradients don't add up to a finite number, else 0; stays on the device.
 
-    Squares, because Adam keeps their running mean: one that overflows would stop its parameter for good.
+    Adam keeps a running mean of squares: one that overflows would stop its parameter for good.
     """
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     return 1.0 - torch.isfinite(get_total_norm(gradients)).float()
@@ -41,10 +41,9 @@ def step_if_finite(optimizer: Optimizer, is_broken: Float[Tensor, ""]) -> bool:
 
 
 class FiniteOptimizers(Optimizers):
-    """nerfstudio's optimisers; a step whose gradient isn't finite is skipped and counted.
+    """nerfstudio's optimisers, with averaged gradients; a step whose gradient isn't finite is skipped and counted.
 
-    The iteration still counts as one: learning rate, λ, view and batch go by its number, and the next one sees others.
-    Gradients are averaged over all processes before, so that all of them skip the same steps.
+    The iteration still counts as one: learning rate, λ, view and batch go by its number.
     """
 
     def __init__(self, config: Dict[str, Any], param_groups: Dict[str, List[nn.Parameter]]) -> None:
@@ -53,7 +52,7 @@ class FiniteOptimizers(Optimizers):
         self._skipped = torch.zeros(2, device=device)
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: List[str]) -> None:
-        """Steps these groups, or none of them."""
+        """Steps these groups, or none of them, alike in all processes."""
         parameters = [parameter for name in param_groups for parameter in self.parameters[name]]
         if not parameters:
             return
