@@ -1,7 +1,4 @@
-"""How a scene was captured, and paths of cameras that follow from it: to measure on, to show a scene, to add views.
-
-Poses have the columns right, up, back and position.
-"""
+"""How a scene was captured, and paths of cameras that follow from it; a pose's columns: right, up, back, position."""
 
 import itertools
 import math
@@ -17,10 +14,8 @@ from sparsestyle_ns.utils.errors import InputError
 
 MAX_SPREAD = 45.0
 """Degrees by which a camera of a forward-facing capture may look aside from the mean viewing direction."""
-NUM_FRAMES = 24
-"""Frames of the path, at least."""
-ARC_STEP = math.radians(2.0)
-"""Angle between neighbouring frames of an arc."""
+NUM_FRAMES, ARC_STEP = 24, math.radians(2.0)
+"""Frames of the measuring path, at least, and the angle between those of an arc."""
 FLIGHT_STEPS = 20
 """Poses of a flight that a frame chooses from, so that its speed can change without jerks."""
 
@@ -60,11 +55,7 @@ def measuring_path(cameras: Cameras) -> Cameras:
 
 
 def showing_path(cameras: Cameras, frames: int) -> Cameras:
-    """A closed path that shows a scene, one camera a frame; the last frame is just before the first.
-
-    A flight through two or more training cameras that look one way, slow where it turns, or one full turn about what
-    they look at, as in `unseen_places`.
-    """
+    """A closed path that shows a scene, one camera a frame: there and back, slow where it turns, or one full turn."""
     poses = cameras.camera_to_worlds.cpu().float()
     if not is_forward_facing(poses):
         return unseen_places(cameras, frames)
@@ -74,10 +65,7 @@ def showing_path(cameras: Cameras, frames: int) -> Cameras:
 
 
 def unseen_places(cameras: Cameras, count: int) -> Cameras:
-    """So many cameras (a few more on a way) at equal steps where photos might have been taken.
-
-    Two or more training cameras; the way from each to the next, or a full circle, chosen as in `measuring_path`.
-    """
+    """Cameras at equal steps where photos might have been taken: a few more on the way between, or on a full circle."""
     # In float64, whose rounding, which differs with where vectors lie in memory, doesn't reach the float32 result.
     poses = cameras.camera_to_worlds.cpu().double()
     if is_forward_facing(poses):

@@ -1,7 +1,4 @@
-"""Grids that remember what each part of the cube holds, so that samples go where something is.
-
-In stage 1 one follows the field as it learns; once the coarse field is frozen, one says which cells are empty.
-"""
+"""Grids that remember what each part of the cube holds, so that samples go where something is."""
 
 from typing import Callable, NamedTuple, Optional
 
@@ -34,7 +31,7 @@ def grid_cells(positions: Float[Tensor, "*batch 3"], resolution: int) -> Int[Ten
 
 
 class DensityGrid(nn.Module):
-    """σ per cell of the cube [−1, 1]³, `resolution` cells a side; `initial` before anything is known."""
+    """σ per cell of the cube, `resolution` a side, of a field that learns; `initial` before anything is known."""
 
     density: Float[Tensor, "cells"]
 
@@ -69,11 +66,9 @@ class DensityGrid(nn.Module):
         even_share: float,
         generator: Optional[torch.Generator] = None,
     ) -> Float[Tensor, "rays edges"]:
-        """Borders of `num_samples` samples on each ray, dense where the remembered density is seen from the camera.
+        """Borders of samples on each ray, dense where the remembered density is seen from the camera.
 
-        They follow a histogram of the remembered densities' weights on `num_bins` even bins, each widened to its
-        neighbours. `even_share` of its mass, in (0, 1], is spread evenly, so that no part of a ray is forgotten; a
-        `generator` moves borders at random.
+        They follow its weights on even bins, of which a share in (0, 1] is spread evenly; a `generator` moves them.
         """
         rays = len(segments.hit)
         edges = even_edges(rays, num_bins, self.density.device, generator)
@@ -104,10 +99,7 @@ class Occupancy(nn.Module):
     def measure(
         self, density: Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]], min_alpha: float, chunk: int
     ) -> None:
-        """Marks the cells in which a ray would meet an opacity of at least `min_alpha`, and their neighbours.
-
-        Opacity is 1 − exp(−σ · cell side) at the cell's centre; `density` gives σ of at most `chunk` points at once.
-        """
+        """Marks the cells with 1 − exp(−σ · cell side) above `min_alpha` at their centre, and their neighbours."""
         side = 2.0 / self.resolution
         axis = (torch.arange(self.resolution, device=self.occupied.device) + 0.5) * side - 1.0
         alphas = []
@@ -124,16 +116,12 @@ class Occupancy(nn.Module):
 
 
 class PackedSamples(NamedTuple):
-    """Samples of a batch of rays in the packed layout (see `volrend`)."""
+    """Samples in the packed layout (see `volrend`): middles of intervals, s in [0, 1] and positions, and lengths δ."""
 
     ray_indices: Int[Tensor, "samples"]
-    """The ray each sample lies on, ascending; front to back on a ray."""
     s: Float[Tensor, "samples"]
-    """Middle of its interval, in [0, 1]."""
     lengths: Float[Tensor, "samples"]
-    """δ in field coordinates; infinite for the last interval of an unbounded space."""
     positions: Float[Tensor, "samples 3"]
-    """Field coordinates of the middle."""
 
     def select(self, keep: Tensor) -> "PackedSamples":
         """Some of the samples, in order, by mask or ascending indices."""
@@ -142,10 +130,7 @@ class PackedSamples(NamedTuple):
 
 @torch.no_grad()
 def march(segments: Segments, occupancy: Optional[Occupancy], num_steps: int, unbounded: bool) -> PackedSamples:
-    """The samples of `num_steps` even steps along each ray that lie in occupied cells; all without an `occupancy`.
-
-    In an unbounded space the last step is always kept: its interval goes on to infinity.
-    """
+    """The samples of even steps along each ray that lie in occupied cells, and an unbounded space's last one."""
     edges = even_edges(len(segments.hit), num_steps, segments.hit.device)
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
     positions = segments.positions(middle)

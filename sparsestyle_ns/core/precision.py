@@ -14,7 +14,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 Precision = Literal["auto", "float32", "tf32", "bfloat16"]
 """auto: bfloat16 where the device multiplies it, else float32. tf32: NVIDIA's 19-bit format, in forward passes and from
-Ampere on; elsewhere the same as float32."""
+Ampere on; elsewhere as float32."""
 
 
 def multiplies_tf32(device: torch.device) -> bool:

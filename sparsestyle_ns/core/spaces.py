@@ -17,8 +17,7 @@ from torch import Tensor, nn
 from sparsestyle_ns.core.ndc import ndc_distance, ndc_parameter, ndc_rays
 
 MAX_DISTANCE = 1e4
-"""The distance that stands for infinity in depth maps, in units of the scene: of the near plane's distance in a
-forward-facing space, of the contraction's unit in a contracted one."""
+"""Stands for infinity in depth maps, in units of the near plane's distance or of the contraction's unit."""
 
 
 class Segments(ABC):
@@ -100,7 +99,7 @@ class _BoxSegments(LinearSegments):
 
 @dataclass
 class ContractedSegments(Segments):
-    """Segments of world rays, bent by the contraction; origins and `near` are in multiples of `unit`, a world length."""
+    """Segments of world rays, bent by the contraction; origins and `near` are in multiples of `unit`, in the world."""
 
     origins: Float[Tensor, "rays 3"]
     directions: Float[Tensor, "rays 3"]
@@ -157,10 +156,7 @@ def inverse_spacing(spaced: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 
 def contract(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Points into [−1, 1]³: x/2 within the unit cube, (1 − 1/(2|x|)) x/|x| outside, |·| the largest coordinate.
-
-    The contraction of mip-NeRF 360 (Eq. 10) with the maximum norm, halved.
-    """
+    """x/2 within the unit cube, (1 − 1/(2|x|)) x/|x| outside: mip-NeRF 360's (Eq. 10) with the maximum norm, halved."""
     norm = points.abs().amax(dim=-1, keepdim=True).clamp(min=1.0)
     # Equal to x/2 at norm 1, and so everywhere within the cube. x/|x| comes first: the largest x has no double.
     return (1.0 - 0.5 / norm) * (points / norm)
@@ -198,17 +194,14 @@ class Space(nn.Module, ABC):
 
 
 class ForwardFacingSpace(Space):
-    """Normalised device coordinates (NeRF, appendix C), for cameras that all look one way.
-
-    Depth d lies at z' = 1 − 2 near/d. Samples lie between the two depths of `depth_range`; the last one's interval goes
-    on to infinity. What lies at infinity looks the same from everywhere: with few photos, a field that puts a whole
-    photo there is hard to dislodge.
+    """Normalised device coordinates (NeRF, appendix C), for cameras that all look one way: depth d at 1 − 2 near/d.
 
     Args:
         box: NDC box that holds all views' frusta; between the depths it becomes the cube.
         focal_over_half_size: 2f/width and 2f/height.
         near: distance of the near plane in world units.
-        depth_range: depths of the nearest and the farthest thing, in world units; None for all from `near` on.
+        depth_range: depths in world units between which samples lie; None for all from `near` on. What lies at infinity
+            looks the same from everywhere: with few photos, a field that puts a whole photo there is hard to dislodge.
     """
 
     unbounded = True
@@ -245,10 +238,7 @@ class ForwardFacingSpace(Space):
 
 
 class BoxSpace(Space):
-    """An axis-aligned box in world coordinates, for an object with nothing behind it; its longest side is the cube's.
-
-    Rays start no closer to the camera than `near`, in half sides of the cube.
-    """
+    """An axis-aligned box in the world, whose longest side is the cube's; rays start at `near`, in half sides of it."""
 
     unbounded = False
 
@@ -270,10 +260,7 @@ class BoxSpace(Space):
 
 
 class ContractedSpace(Space):
-    """All of space, contracted, for cameras all around and a background beyond them.
-
-    Coordinates below `unit`, a length in the world above 0, aren't bent. Rays start at `near` of that unit.
-    """
+    """All of space, bent beyond `unit`, a length in the world above 0, of which rays start at `near`."""
 
     unbounded = True
 

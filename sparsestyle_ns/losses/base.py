@@ -31,7 +31,7 @@ class StylizationLoss(ABC):
     """A loss of views, made once for the painting that they are to become like."""
 
     weight: ClassVar[float] = 0.0
-    """In the sum, unless the run's settings say otherwise; 0 is off, and costs nothing."""
+    """In the sum, unless the run's settings say otherwise; 0 is off."""
 
     def __init__(self, painting: PaintingFeatures) -> None:  # noqa: B027 - a loss may need nothing of the painting
         pass

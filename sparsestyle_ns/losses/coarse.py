@@ -28,9 +28,8 @@ def matched_depth_loss(
 ) -> Float[Tensor, ""]:
     """Mean over rays of Σ w_i |s_i − s| + 1 − Σ w_i: how far from a known point a ray ends.
 
-    s_i are the middles of the samples, whose borders lie in [0, 1]; light that goes on counts as at distance 1. The
-    absolute value keeps a wrong match from outweighing right ones. One at an end of its segment, s ≤ 0 or s ≥ 1, lies
-    outside of the scene and doesn't count.
+    s_i are the middles of the samples, whose borders lie in [0, 1]; light that goes on counts as at distance 1. A point
+    at an end of its segment, s ≤ 0 or s ≥ 1, lies outside of the scene and doesn't count.
     """
     middles = 0.5 * (edges[:, 1:] + edges[:, :-1])
     missed = (weights * (middles - s).abs()).sum(dim=-1) + 1.0 - weights.sum(dim=-1)

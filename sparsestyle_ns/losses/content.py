@@ -23,13 +23,10 @@ def content_loss(features: Float[Tensor, "*shape"], target: Float[Tensor, "*shap
     """Squared error of features, relative to the size of the target's (L_content of Eq. 5).
 
     mean((f − f*)²) / mean(f*²): 0 for equal features, 1 for features that have all vanished. The target gets no
-    gradient; where it is all zero, the squared error is returned as it is.
+    gradient; where it is all zero, the squared error is returned as it is. A `ValueError` for different shapes.
 
-    The paper, like ARF (Sec. 4), takes the squared error alone, whose size depends on the network's activations. The
-    division, by a constant of the target, lets the same λ mean the same for every backbone.
-
-    Raises:
-        ValueError: the two shapes differ, which broadcasting would otherwise hide.
+    The paper, like ARF (Sec. 4), takes the squared error alone, whose size depends on the network's activations. By the
+    division, λ means the same for every backbone.
 
     Example:
         >>> content_loss(torch.tensor([3.0, 0.0]), torch.tensor([0.0, 4.0]))

@@ -36,10 +36,7 @@ def nearest_neighbors(
     """For each feature vector the style's most similar one, by cosine.
 
     The search compares everything with everything, `chunk_size` rows of either at a time; a `StyleIndex`, made once for
-    a style, gives the same answer faster. Of several equally similar ones the first is given. No gradient passes.
-
-    Raises:
-        ValueError: there are no style features.
+    a style, gives the same answer faster: the first of several equally similar ones. A `ValueError` without any.
     """
     if isinstance(style_features, StyleIndex):
         return style_features.nearest(features)
@@ -61,15 +58,11 @@ def nnfm_loss(
     (1/N) Σ_i min_j (1 − cos(f_i, s_j)) (ARF, Sec. 4). The choice of j is taken as given when differentiating, as it
     is constant almost everywhere, and the style gets no gradient.
 
-    Args:
-        features: of the rendered view, of lengths up to 1e18. One no longer than `SHORTEST` has no direction: it counts
-            as cosine 0 and gets a gradient of zero.
-        style_features: of the style image, or an index of them.
-        neighbors: what `nearest_neighbors` gave, where it is known.
+    Features have lengths up to 1e18. One no longer than `SHORTEST` has no direction: it counts as cosine 0 and gets a
+    gradient of zero. `neighbors` are what `nearest_neighbors` gave, where it is known.
 
     Example:
-        >>> maps = torch.rand(1, 768, 47, 63)
-        >>> vectors = maps.permute(0, 2, 3, 1).flatten(0, 2)
+        >>> vectors = torch.rand(2961, 768)
         >>> nnfm_loss(vectors, style_features=vectors).abs() < 1e-5
         tensor(True)
     """

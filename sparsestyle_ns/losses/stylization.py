@@ -1,7 +1,4 @@
-"""The losses of stage 2 by name, and what a stylised view is compared with.
-
-A new loss is a file with a `StylizationLoss`, and its line in `LOSSES`.
-"""
+"""The losses of stage 2 by name, and what a stylised view is compared with."""
 
 from dataclasses import dataclass
 from typing import Collection, Dict, Optional, Type
@@ -17,7 +14,7 @@ from sparsestyle_ns.losses.nnfm import NNFMLoss
 from sparsestyle_ns.style.backbone import Backbone
 
 LOSSES: Dict[str, Type[StylizationLoss]] = {"content": ContentLoss, "style": NNFMLoss}
-"""All stylisation losses, by name."""
+"""A new one is a file with a `StylizationLoss`, and its entry here."""
 
 
 def default_weights() -> Dict[str, float]:
@@ -78,12 +75,11 @@ def covered_rows(
 
 
 class StyleTargets:
-    """A painting as the feature network sees it, and the losses of pictures against it (the terms of Eq. 5).
+    """A painting in [0, 1] as the feature network sees it, and the losses of pictures against it (the terms of Eq. 5).
 
-    Kept out of the model's modules: a stylised checkpoint holds neither the network nor the painting.
+    Not a module of the model: a stylised checkpoint holds neither the network nor the painting.
 
     Args:
-        style_image: in [0, 1], on the device of the network.
         feature_side: longer side, in pixels, at which the network sees rendered and content pictures.
         style_side: longer side, in pixels, at which it sees the style image; it sets how large strokes are.
         style_features: at most so many of the style image's feature vectors count, drawn at random; None: all.
@@ -122,10 +118,7 @@ class StyleTargets:
         content: Float[Tensor, "1 C h w"],
         accumulation: Optional[Float[Tensor, "H W"]] = None,
     ) -> StylizedView:
-        """A rendered picture in [0, 1], and the features of the one that it must stay like, ready for the losses.
-
-        Features count where the scene's opacity, the accumulation, is above half; None: all count.
-        """
+        """A rendered picture in [0, 1], ready for the losses; features count where the accumulation is above half."""
         features, target = (covered_rows(maps, accumulation) for maps in (self.features(image), content))
         return StylizedView(image, features, target)
 

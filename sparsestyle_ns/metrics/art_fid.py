@@ -4,7 +4,7 @@ LPIPS is between each stylised picture and its content; FID between stylised pic
 an Inception-v3 that was trained on art. It is measured where both weight files are in the torch hub cache.
 
 Its authors compare thousands of pictures with as many paintings. A scene has a few views and one painting, so here all
-are resized and cut into overlapping squares. Figures rank rows that are measured alike, and can't be compared with others'.
+are resized and cut into overlapping squares. Figures rank rows that are measured alike, not beside others'.
 """
 
 import functools
@@ -24,12 +24,8 @@ from sparsestyle_ns.utils.weight_files import check_tensor, hub_file, read_state
 ART_INCEPTION_FILE = "art_inception.pth"
 HEADS = ("fc1.", "fc2.", "AuxLogits1.", "AuxLogits2.")
 """Classifiers in that file, which the features don't need."""
-SQUARE = 299
-"""Side of the squares, in pixels: that of Inception-v3's pictures."""
-SHORTER_SIDE = 448
-"""Shorter side, in pixels, of the pictures that they are cut from."""
-STEP = 75
-"""Pixels from one square to the next, at most."""
+SQUARE, SHORTER_SIDE, STEP = 299, 448, 75
+"""Pixels: side of the squares, shorter side of what they are cut from, and way from one to the next, at most."""
 
 
 def frechet_distance(first: Float[Tensor, "n C"], second: Float[Tensor, "m C"]) -> float:
@@ -66,13 +62,7 @@ def squares(picture: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "squares 3 side 
 
 @functools.lru_cache(maxsize=1)
 def load_art_inception(path: Path) -> nn.Module:
-    """The Inception-v3 of a file as ArtFID's authors publish it; pictures in [0, 1] in, 2048 features a picture out.
-
-    As in the authors' code, colours go in as they are, and the features are the pooled ones before the heads.
-
-    Raises:
-        InputError: the file can't be read, or is of another network.
-    """
+    """ArtFID's Inception-v3, from pictures in [0, 1] to 2048 features; an `InputError` for a file of another network."""
     from torchvision.models import inception_v3
 
     with torch.device("meta"):  # torch's random state stays untouched
@@ -109,7 +99,7 @@ def why_left_out(figures: Dict[str, float]) -> str:
 
 
 class ArtFID:
-    """ArtFID of pictures that are added one by one, by the network of `load_art_inception`; the painting in [0, 1]."""
+    """ArtFID of pictures that are added one by one; they and the painting in [0, 1]."""
 
     def __init__(self, network: nn.Module, painting: Float[Tensor, "3 H W"]) -> None:
         self.network = network
@@ -119,7 +109,7 @@ class ArtFID:
 
     @classmethod
     def against(cls, painting: Float[Tensor, "3 H W"]) -> Optional["ArtFID"]:
-        """With the weights in the torch hub cache; None where some are missing. Raises as `load_art_inception` does."""
+        """With the weights in the torch hub cache; None where some are missing."""
         return None if missing_weights() else cls(load_art_inception(hub_file(ART_INCEPTION_FILE)), painting)
 
     @torch.no_grad()

@@ -78,8 +78,7 @@ def is_occluded(forward: Float[Tensor, "*batch 2"], backward: Float[Tensor, "*ba
 def correspond(first: Surface, second: Surface) -> Correspondence:
     """Where the second view shows what the first one's pixels show.
 
-    A pixel is visible where its point lies before the second camera and inside its picture, both views show a surface
-    there, and the way there and back by either view's own points agrees (`is_occluded`).
+    Both must show a surface there, and the way there and back agree (`is_occluded`).
     """
     height, width = second.covered.shape
     pixels, in_front = second.camera.project(first.points)

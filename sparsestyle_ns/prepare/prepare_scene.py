@@ -24,7 +24,7 @@ from sparsestyle_ns.prepare.framing import (
 )
 from sparsestyle_ns.prepare.poses import TRANSFORMS, Poses, find_poses, fits
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.ffmpeg import put_ffmpeg_on_path
+from sparsestyle_ns.utils.machine import put_ffmpeg_on_path
 
 PoseSource = Literal["auto", "file", "colmap"]
 

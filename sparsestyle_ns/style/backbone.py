@@ -1,4 +1,4 @@
-"""What a feature network is to the rest of the package, and the weight file it is made from."""
+"""What a feature network is, and the weight file it is made from."""
 
 import hashlib
 from abc import ABC, abstractmethod
@@ -15,7 +15,7 @@ from sparsestyle_ns.utils.weight_files import read_state
 
 @dataclass(frozen=True)
 class BackboneDescription:
-    """Which feature network is in use, by its name on the command line, and where its weights came from, in words."""
+    """Which feature network is in use, and where its weights came from, in words."""
 
     name: str
     source: str
@@ -45,12 +45,10 @@ class Weights:
 
 
 class Backbone(nn.Module, ABC):
-    """A frozen network that turns pictures into feature maps."""
+    """A frozen network, `--backbone NAME`, that turns pictures into feature maps."""
 
     name: ClassVar[str]
-    """On the command line, `--backbone NAME`."""
     channels: ClassVar[int]
-    """Of the feature maps."""
     smallest_side: ClassVar[int]
     """Pixels that each side of a picture must have."""
     description: BackboneDescription

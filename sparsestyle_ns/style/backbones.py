@@ -16,12 +16,8 @@ BackboneChoice = Literal[("auto", *BACKBONES)]
 def load_backbone(name: str = "auto", weights: Optional[Path] = None) -> Backbone:
     """The feature network, on the CPU, with weights from a file or from wherever this machine has them.
 
-    Args:
-        name: a key of `BACKBONES`, or `auto`: the network that `weights` is of, else the first that has weights here.
-        weights: a weight file, such as a state dict of torchvision's VGG-16; layers after relu3_3 may be missing.
-
-    Raises:
-        InputError: there are no weights to be had, or the file is not of the network asked for.
+    `auto` is the network that the file is of, else the first that has weights here. An `InputError` where there are no
+    weights to be had, or the file is not of the network asked for.
     """
     if weights is not None:
         return _load_file(name, Path(weights).expanduser())

@@ -11,19 +11,19 @@ from torch import Tensor
 
 from sparsestyle_ns.utils.errors import InputError
 
+Mean = Float[Tensor, "3"]
+Covariance = Float[Tensor, "3 3"]
+
 SMALLEST_SPREAD = 1 / 255
 """Standard deviation, in units of the colour range, below which a direction counts as a rounding error."""
 
 
 def color_moments(
     colors: Float[Tensor, "*batch 3"], weights: Optional[Float[Tensor, "*batch"]] = None
-) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
-    """Mean μ = Σ_i w_i c_i / Σ_i w_i and covariance Σ_i w_i (c_i − μ)(c_i − μ)ᵀ / Σ_i w_i of colours, in float64.
+) -> tuple[Mean, Covariance]:
+    """Mean μ = Σ_i w_i c_i / Σ_i w_i and covariance Σ_i w_i (c_i − μ)(c_i − μ)ᵀ / Σ_i w_i, w ≥ 0, in float64.
 
-    Weights are 0 or more; without them all colours count alike.
-
-    Raises:
-        InputError: there are no colours, or no weight is positive.
+    An `InputError` where no weight is positive.
     """
     points = colors.reshape(-1, 3).double()
     weight = torch.ones_like(points[:, :1]) if weights is None else weights.reshape(-1, 1).double()
@@ -36,10 +36,7 @@ def color_moments(
 
 
 def gaussian_distance(
-    first_mean: Float[Tensor, "3"],
-    first_covariance: Float[Tensor, "3 3"],
-    second_mean: Float[Tensor, "3"],
-    second_covariance: Float[Tensor, "3 3"],
+    first_mean: Mean, first_covariance: Covariance, second_mean: Mean, second_covariance: Covariance
 ) -> Float[Tensor, ""]:
     """2-Wasserstein distance between two Gaussians, in float64 (Dowson and Landau 1982).
 
@@ -52,16 +49,13 @@ def gaussian_distance(
     return ((first_mean.double() - second_mean.double()).square().sum() + spread).sqrt()
 
 
-def _square_root(covariance: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+def _square_root(covariance: Covariance) -> Float[Tensor, "3 3"]:
     variances, axes = torch.linalg.eigh(covariance)
     return (axes * variances.clamp_min(0).sqrt()) @ axes.T
 
 
 def palette_transform(
-    content_mean: Float[Tensor, "3"],
-    content_covariance: Float[Tensor, "3 3"],
-    style_mean: Float[Tensor, "3"],
-    style_covariance: Float[Tensor, "3 3"],
+    content_mean: Mean, content_covariance: Covariance, style_mean: Mean, style_covariance: Covariance
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """The map c ↦ A c + b that gives the content's colours the style's mean and covariance.
 

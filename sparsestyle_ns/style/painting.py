@@ -14,18 +14,15 @@ from torch import Tensor
 
 from sparsestyle_ns.utils.errors import InputError
 
-SMALLEST_SIDE = 8
-"""Pixels a side that the feature network needs: it halves an image twice before block 3."""
-THUMBNAIL_SIDE = 200
-"""Longer side of a painting's thumbnail, in pixels."""
+SMALLEST_SIDE, THUMBNAIL_SIDE = 8, 200
+"""Pixels: what each side of a painting must have, and the longer side of its thumbnail."""
 
 
 @dataclass(frozen=True)
 class Painting:
-    """A painting, decoded once.
+    """A painting, decoded once: all that Pillow reads, PNG of 16 bits without loss, transparent pixels laid over white.
 
-    Everything Pillow reads is taken, PNG of 16 bits without loss; of an animation the first frame. Transparent pixels
-    are laid over white, and colour profiles not applied. `name` is its file's, without folders, `data` what is in it.
+    Colour profiles are not applied. `name` is its file's, without folders, and `data` what is in it.
     """
 
     name: str
@@ -35,11 +32,7 @@ class Painting:
 
     @classmethod
     def read(cls, path: Union[str, Path]) -> "Painting":
-        """Reads a file.
-
-        Raises:
-            InputError: there is no such file, it can't be read as an image, or it has fewer than 8 pixels a side.
-        """
+        """Reads a file; an `InputError` where it isn't an image of 8 pixels a side or more."""
         path = Path(path).expanduser()
         data = _read_bytes(path)
         return cls(path.name, data, _decode(data, path))

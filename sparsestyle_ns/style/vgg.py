@@ -9,7 +9,7 @@ import itertools
 import socket
 import sys
 from pathlib import Path
-from typing import Any, ClassVar, Dict, Optional
+from typing import Any, ClassVar, Dict, Optional, Tuple
 
 import torch
 from jaxtyping import Float
@@ -32,9 +32,6 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 PLAIN_CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
 """Where VGG-16 has convolutions; VGG-19 and the variants with batch normalisation have parameters elsewhere too."""
 
-CONVOLUTIONS = ("blocks.0.0", "blocks.0.1", "blocks.1.0", "blocks.1.1", "blocks.2.0", "blocks.2.1", "blocks.2.2")
-POOLS = ("pools.0", "pools.1")
-
 
 class BlurPool(nn.Module):
     """Max pooling of stride 1, then a blur of stride 2: halves an image without aliasing."""
@@ -54,9 +51,9 @@ class VGGBlock3(Backbone):
 
     channels = sum(BLOCK_CHANNELS[-1][1:])
     smallest_side = 8
-    """Each side is halved twice before block 3."""
-    stored: ClassVar[Dict[str, str]]
-    """What the weight file calls the layers of this module that have weights."""
+    stored: ClassVar[Tuple[str, ...]]
+    """What the weight file calls the layers that have weights, in order, convolutions first."""
+    is_blurred: ClassVar[bool] = False
 
     def __init__(self, description: BackboneDescription) -> None:
         super().__init__()
@@ -67,8 +64,7 @@ class VGGBlock3(Backbone):
                 for channels in BLOCK_CHANNELS
             )
             self.pools = nn.ModuleList(
-                BlurPool(channels[-1]) if POOLS[0] in self.stored else nn.MaxPool2d(2)
-                for channels in BLOCK_CHANNELS[:-1]
+                BlurPool(channels[-1]) if self.is_blurred else nn.MaxPool2d(2) for channels in BLOCK_CHANNELS[:-1]
             )
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
@@ -76,7 +72,7 @@ class VGGBlock3(Backbone):
     @classmethod
     def accepts(cls, state: Dict[str, Any]) -> bool:
         """See `Backbone.accepts`."""
-        return any(str(key).rpartition(".")[0] in cls.stored.values() for key in state)
+        return any(str(key).rpartition(".")[0] in cls.stored for key in state)
 
     @classmethod
     def load(cls, weights: Weights, state: Dict[str, Any]) -> "VGGBlock3":
@@ -84,9 +80,11 @@ class VGGBlock3(Backbone):
         network, trunk = cls(weights.describe(cls.name)), {}
         try:
             _refuse_relatives(state)
+            layers = dict.fromkeys(key.rpartition(".")[0] for key in network.state_dict())
+            stored = dict(zip(layers, cls.stored, strict=True))
             for key, value in network.state_dict().items():
                 layer, _, parameter = key.rpartition(".")
-                trunk[key] = check_tensor(state, f"{cls.stored[layer]}.{parameter}", value.shape).float()
+                trunk[key] = check_tensor(state, f"{stored[layer]}.{parameter}", value.shape).float()
         except ValueError as error:
             raise InputError(
                 f"The VGG weight file {weights.path} is not VGG-16 up to relu3_3 ({error}): give torchvision's "
@@ -113,7 +111,7 @@ class VGG16(VGGBlock3):
     """torchvision's VGG-16 (IMAGENET1K_V1): from the torch hub cache, or downloaded into it."""
 
     name = "vgg16"
-    stored: ClassVar = dict(zip(CONVOLUTIONS, (f"features.{n}" for n in PLAIN_CONVOLUTIONS), strict=False))
+    stored: ClassVar = tuple(f"features.{n}" for n in PLAIN_CONVOLUTIONS[:7])
 
     @classmethod
     def find_weights(cls) -> Optional[Weights]:
@@ -140,13 +138,10 @@ class ShiftTolerantVGG16(VGGBlock3):
     """The anti-aliased trunk inside the package stlpips-pytorch, of which only the weight file is read."""
 
     name = "vgg16-shift-tolerant"
-    stored: ClassVar = dict(
-        zip(
-            (*CONVOLUTIONS, *POOLS),
-            (f"net.slice{place}" for place in ("1.0", "1.2", "2.6", "2.8", "3.12", "3.14", "3.16", "2.5", "3.11")),
-            strict=True,
-        )
+    stored: ClassVar = tuple(
+        f"net.slice{n}" for n in ["1.0", "1.2", "2.6", "2.8", "3.12", "3.14", "3.16", "2.5", "3.11"]
     )
+    is_blurred = True
 
     @classmethod
     def find_weights(cls) -> Optional[Weights]:

@@ -1,9 +1,7 @@
 """Several processes that train one model together, `--machine.num-devices N`.
 
-All hold the same model and see the same batch or view. Each renders its own share of the rays; pixels are gathered, so
-that every process has the whole picture, and gradients averaged before each step. What comes out is what one process
-gives, up to rounding. nerfstudio's DistributedDataParallel averages gradients of the model's `forward` only, which a
-step of hier-style doesn't go through.
+All see the same batch or view. Each renders its share of the rays; pixels are gathered, and gradients averaged before
+each step. nerfstudio's DistributedDataParallel would average those of `forward` only, which hier-style doesn't call.
 """
 
 import os
@@ -33,10 +31,7 @@ def shard_rays(rows: Shaped[Tensor, "rows ..."]) -> Shaped[Tensor, "own ..."]:
 
 
 def gather_rays(own: Float[Tensor, "own ..."], num_rows: int) -> Float[Tensor, "rows ..."]:
-    """All rows, from what became of each process's rows of `shard_rays`; differentiable in this process's own.
-
-    Gradients count N-fold: their mean over the processes is the gradient of the whole.
-    """
+    """All rows, from what became of each process's rows of `shard_rays`; differentiable in this process's own."""
     return own if num_processes() == 1 else _GatherRays.apply(own, num_rows)
 
 
@@ -52,6 +47,7 @@ class _GatherRays(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Any:
+        # N-fold: the mean over the processes is the gradient of the whole.
         return num_processes() * shard_rays(grad), None
 
 

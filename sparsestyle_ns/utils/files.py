@@ -17,12 +17,8 @@ def write_whole(
 ) -> Path:
     """Writes a file that gets its name only when it is whole and on the disk; makes its folder; returns its path.
 
-    Args:
-        content: text, which is written in UTF-8, bytes, or a function that writes them into an open file.
-        temporary: where the unfinished file stands, on the same disk; None: beside `target`, as NAME.unfinished.
-
-    Raises:
-        OSError: the file can't be written; the former one is still there.
+    `content` is text, bytes, or a function that writes them into an open file. The unfinished file stands at
+    `temporary`, on the same disk, or beside the target. After an `OSError` the former file is still there.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     unfinished = temporary or target.with_name(target.name + ".unfinished")
@@ -46,12 +42,9 @@ def write_whole(
 
 
 def prepare_output(output_path: Path, what: str, example: str) -> None:
-    """Makes the folder of a file that a command is to write, before the work for it begins.
+    """Makes the folder of a file that a command is to write; an `InputError` where that file can't be written.
 
-    Errors call the file `what`, and `example` is a good name for it.
-
-    Raises:
-        InputError: the folder can't be made or written to, or the file's name is that of a folder.
+    Its sentence calls the file `what`; `example` is a good name for it.
     """
     if output_path.is_dir():
         raise InputError(f"--output-path {output_path} is a folder; name a file, such as {output_path / example}.")

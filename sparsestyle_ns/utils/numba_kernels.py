@@ -1,7 +1,6 @@
 """Inner loops that torch has no operator for, compiled by numba for the CPU.
 
-Numba's own thread pools can't be entered from two threads at once, as a viewer beside training does; so kernels are
-compiled for one thread, and the work is shared out here.
+Numba's own thread pools can't be entered from two threads at once, such as a viewer's; work is shared out here.
 """
 
 import functools
@@ -18,10 +17,7 @@ R = TypeVar("R")
 
 
 def kernel(function: Callable[..., None]) -> Callable[..., None]:
-    """Compiles a function of arrays and numbers on its first call, for later processes too; it runs without the GIL.
-
-    It gives its results in arrays, and must stay inside their bounds: nothing checks.
-    """
+    """Compiles a function of arrays and numbers, on its first call, to run without the GIL; nothing checks bounds."""
     options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
     try:
         return numba.njit(cache=True, **options)(function)

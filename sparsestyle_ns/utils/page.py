@@ -1,7 +1,4 @@
-"""HTML pages of this package: one file that needs nothing else, light or dark, made from Jinja2 templates.
-
-`templates/base.html` has what all pages share, `templates/macros.html` pictures and tables.
-"""
+"""HTML pages of this package: one file that needs nothing else, made from Jinja2 templates."""
 
 import base64
 import io

@@ -1,9 +1,7 @@
 """How far long work is, and how long it still takes: bars on a terminal, a line now and then in a log.
 
-All bars of a process are on one display, also those of several threads and bars within bars, and what is printed
-meanwhile appears above them. Of several processes that train together, the first shows them; where CONSOLE is quiet,
-nothing is shown. A process that was started by another one tells it how far it is in a small JSON file, which is
-replaced as a whole, so that a reader finds one that is complete or none.
+All bars of a process are on one display, above which what is printed meanwhile appears. Of several processes that train
+together, the first shows them. A process that was started by another one tells it how far it is in a small JSON file.
 """
 
 import json
@@ -25,10 +23,8 @@ T = TypeVar("T")
 
 PROGRESS_FILE = "SPARSESTYLE_PROGRESS_FILE"
 """Environment variable with that file's path; where it isn't set, nothing is written."""
-SECONDS_BETWEEN_LINES = (10.0, 60.0)
-"""In a log, the least and the most time from one line to the next."""
-SHARE_BETWEEN_LINES = 0.05
-"""Share of the work after which a line comes before the most time has passed."""
+SECONDS_BETWEEN_LINES, SHARE_BETWEEN_LINES = (10.0, 60.0), 0.05
+"""In a log, the least and the most time between lines, and the share of the work after which one comes before that."""
 WORTH_A_LINE = 10.0
 """Seconds from which on finished work leaves a line that says how long it took."""
 SECONDS_BETWEEN_REPORTS = 1.0
@@ -103,29 +99,35 @@ class Bar:
             say(line + (f", {left}" if left else "") + (f"; {note}" if note else ""))
 
     def end(self) -> None:
-        """Takes the bar away; work that took long and is finished leaves a line."""
+        """Work that took long and is finished leaves a line."""
         task = self.task
         if task.visible and task.finished and (task.finished_time or 0.0) >= WORTH_A_LINE:
             done = task.completed - task.fields["first"]
             say(f"{task.description}: {done:.0f}{self._unit} in {duration(task.finished_time)}")
-        self._display.remove_task(task.id)
 
 
 @contextmanager
 def bar(description: str, total: float, done: float = 0, unit: str = "", visible: bool = True) -> Iterator[Bar]:
-    """Shows how far some work is, within a `with`; nothing is shown where there is one thing to do in all.
-
-    `done` was done before, and `unit` is what is counted, for lines in a log.
-    """
-    with _shared_display() as display:
+    """Shows how far work of more than one step is, of which `done` was done before; lines in a log have the `unit`."""
+    global _display
+    with _lock:
+        if _display is None:
+            _display = _make_display()
+            _display.start()
+        display = _display
         number = display.add_task(
             description, total=total, completed=done, visible=visible and total > 1, first=done, note="", unit=unit
         )
-        one = Bar(display, next(task for task in display.tasks if task.id == number))
-        try:
-            yield one
-        finally:
-            one.end()
+    one = Bar(display, next(task for task in display.tasks if task.id == number))
+    try:
+        yield one
+    finally:
+        one.end()
+        with _lock:
+            display.remove_task(number)
+            if not display.tasks:
+                display.stop()
+                _display = None
 
 
 def track(items: Sequence[T], description: str) -> Iterator[T]:
@@ -168,7 +170,6 @@ class _TimeLeftColumn(ProgressColumn):
 
 _lock = threading.Lock()
 _display: Optional[Progress] = None
-_users = 0
 _reported_at = -math.inf
 
 
@@ -183,33 +184,17 @@ def _report(display: Progress) -> None:
         report(ProgressReport(tuple(works)))
 
 
-@contextmanager
-def _shared_display() -> Iterator[Progress]:
-    """The display of all bars: there while at least one is."""
-    global _display, _users
-    with _lock:
-        if _display is None:
-            can_draw = CONSOLE.is_terminal and not (CONSOLE.is_dumb_terminal or CONSOLE.quiet)
-            _display = Progress(
-                TextColumn("{task.description}", markup=False),
-                BarColumn(bar_width=30),
-                MofNCompleteColumn(),
-                _TimeLeftColumn(),
-                TextColumn("{task.fields[note]}", markup=False, style="dim"),
-                console=CONSOLE,
-                transient=True,
-                refresh_per_second=4,
-                speed_estimate_period=120.0,
-                disable=not (can_draw and comms.is_main_process()),
-            )
-            _display.start()
-        _users += 1
-        display = _display
-    try:
-        yield display
-    finally:
-        with _lock:
-            _users -= 1
-            if _users == 0:
-                display.stop()
-                _display = None
+def _make_display() -> Progress:
+    can_draw = CONSOLE.is_terminal and not (CONSOLE.is_dumb_terminal or CONSOLE.quiet)
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=30),
+        MofNCompleteColumn(),
+        _TimeLeftColumn(),
+        TextColumn("{task.fields[note]}", markup=False, style="dim"),
+        console=CONSOLE,
+        transient=True,
+        refresh_per_second=4,
+        speed_estimate_period=120.0,
+        disable=not (can_draw and comms.is_main_process()),
+    )

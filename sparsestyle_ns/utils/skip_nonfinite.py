@@ -1,6 +1,6 @@
 """Optimisers that leave everything as it is where a gradient isn't finite."""
 
-from typing import Any, Dict, Iterable, List, NamedTuple
+from typing import Any, Dict, Iterable, List, Tuple
 
 import torch
 from jaxtyping import Float
@@ -13,27 +13,15 @@ from torch.optim import Optimizer
 from sparsestyle_ns.utils.distributed import average_gradients
 
 
-class Skipped(NamedTuple):
-    """How many steps weren't taken since the optimisers were made, and since the last one that was taken."""
-
-    total: int
-    in_a_row: int
-
-
 def broken(parameters: Iterable[nn.Parameter]) -> Float[Tensor, ""]:
-    """1 where the squares of all gradients don't add up to a finite number, else 0; stays on the device.
-
-    Adam keeps a running mean of squares: one that overflows would stop its parameter for good.
-    """
+    """1 where the squares of all gradients don't add up to a finite number, else 0; stays on the device."""
+    # Adam keeps a running mean of squares: one that overflows would stop its parameter for good.
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     return 1.0 - torch.isfinite(get_total_norm(gradients)).float()
 
 
 def step_if_finite(optimizer: Optimizer, is_broken: Float[Tensor, ""]) -> bool:
-    """Whether to call an optimiser's step; with `is_broken` 1, parameters, means and step count stay as they are.
-
-    Fused optimisers are called with the flag and look at it where they run, so that nothing waits for a GPU.
-    """
+    """Whether to call an optimiser's step; fused ones look at the flag where they run, and nothing waits for a GPU."""
     if getattr(optimizer, "_step_supports_amp_scaling", False):
         optimizer.found_inf = is_broken
         return True
@@ -64,6 +52,7 @@ class FiniteOptimizers(Optimizers):
             param_groups = [name for name in param_groups if step_if_finite(self.optimizers[name], is_broken)]
         super().optimizer_scaler_step_some(grad_scaler, param_groups)
 
-    def skipped(self) -> Skipped:
-        """The counts; waits for a GPU."""
-        return Skipped(*map(int, self._skipped.tolist()))
+    def skipped(self) -> Tuple[int, int]:
+        """How many steps weren't taken in all, and since the last one that was taken; waits for a GPU."""
+        total, in_a_row = map(int, self._skipped.tolist())
+        return total, in_a_row
