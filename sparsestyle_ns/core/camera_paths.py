@@ -55,7 +55,7 @@ def measuring_path(cameras: Cameras) -> Cameras:
 
 
 def showing_path(cameras: Cameras, frames: int) -> Cameras:
-    """A closed path that shows a scene, one camera a frame: there and back, slow where it turns, or one full turn."""
+    """A closed path, one camera a frame: through the cameras and back, slow where it turns, or one turn around all."""
     poses = cameras.camera_to_worlds.cpu().float()
     if not is_forward_facing(poses):
         return unseen_places(cameras, frames)
@@ -65,7 +65,7 @@ def showing_path(cameras: Cameras, frames: int) -> Cameras:
 
 
 def unseen_places(cameras: Cameras, count: int) -> Cameras:
-    """Cameras at equal steps where photos might have been taken: a few more on the way between, or on a full circle."""
+    """`count` cameras or a few more, at equal steps: from each training camera to the next, or on the circle of all."""
     # In float64, whose rounding, which differs with where vectors lie in memory, doesn't reach the float32 result.
     poses = cameras.camera_to_worlds.cpu().double()
     if is_forward_facing(poses):

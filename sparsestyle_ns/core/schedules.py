@@ -22,7 +22,7 @@ def content_weight(step: int, initial: float, decay: float, duration: int) -> fl
 
 
 def ramp(progress: float, start: float, length: float) -> float:
-    """A share that rises evenly from 0 at `start` to 1 at `start + length`, all in shares of the iterations."""
+    """Rises evenly from 0 at `start` to 1 at `start + length`, shares of the iterations; a step where `length` is 0."""
     since = progress - start
     if since >= length:
         return 1.0

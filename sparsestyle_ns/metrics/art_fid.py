@@ -62,7 +62,7 @@ def squares(picture: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "squares 3 side 
 
 @functools.lru_cache(maxsize=1)
 def load_art_inception(path: Path) -> nn.Module:
-    """ArtFID's Inception-v3, from pictures in [0, 1] to 2048 features; an `InputError` for a file of another network."""
+    """ArtFID's Inception-v3, from pictures in [0, 1] to 2048 features; an `InputError` for another network's file."""
     from torchvision.models import inception_v3
 
     with torch.device("meta"):  # torch's random state stays untouched

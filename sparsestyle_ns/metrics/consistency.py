@@ -56,7 +56,7 @@ def masked_distance(metric: Metric, first: Picture, second: Picture, visible: Ma
 
 @torch.no_grad()
 def pair_consistency(first: Picture, second: Picture, correspondence: Correspondence) -> Dict[str, float]:
-    """`rmse`, `ssim` and `perceptual_metrics` of a view and another one warped to it; nothing if they share no pixel."""
+    """`rmse`, `ssim` and `perceptual_metrics` of a view and another warped to it; nothing where they share no pixel."""
     visible = correspondence.visible
     if not visible.any():
         return {}

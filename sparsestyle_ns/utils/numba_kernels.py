@@ -1,6 +1,6 @@
 """Inner loops that torch has no operator for, compiled by numba for the CPU.
 
-Numba's own thread pools can't be entered from two threads at once, such as a viewer's; work is shared out here.
+Numba's own thread pools can't be entered from two threads at once, as a viewer does: work is shared out here.
 """
 
 import functools
