@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from sparsestyle_ns.data.matches import PointMatches, why_unmatched
-from sparsestyle_ns.effects.base import Decisions, Effect, Measurement
+from sparsestyle_ns.effects.base import Decisions, Measurement
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_STOPS = 0.1
@@ -57,9 +57,6 @@ class ExposureCorrection(nn.Module):
     """A gain for each photo and channel, exp(g) with the mean of g over the photos at 0.
 
     That gauge makes the scene's own colours those of the mean exposure, which is what views without a photo show.
-
-    Args:
-        num_photos: how many.
     """
 
     def __init__(self, num_photos: int) -> None:
@@ -76,8 +73,7 @@ class ExposureCorrection(nn.Module):
         """What photos show of a scene: the light from it times the photo's gain, the background as it is.
 
         Args:
-            rgb: the scene's own colours, background included.
-            behind: the background's part of them.
+            rgb: the scene's own colours, background included; `behind` is the background's part of them.
             photos: which photo each ray belongs to.
         """
         return (rgb - behind) * self.gains()[photos] + behind
@@ -103,6 +99,3 @@ def measure_exposure(scene: Scene) -> Measurement:
     stops = float(np.abs(gains).max() / np.log(2.0))
     words = f"stops at most between a photo and the mean, by {len(scene.matches)} matched points"
     return Measurement(stops >= MIN_STOPS, words, stops, MIN_STOPS)
-
-
-EXPOSURE = Effect("exposure", measure_exposure)

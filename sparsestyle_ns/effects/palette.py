@@ -1,6 +1,6 @@
 """The painting's palette, given to the photos before stylising (ARF's transfer of mean colour and covariance)."""
 
-from sparsestyle_ns.effects.base import Effect, Measurement
+from sparsestyle_ns.effects.base import Measurement
 from sparsestyle_ns.effects.scene import Scene, foreground_colors
 from sparsestyle_ns.style.color import color_moments, gaussian_distance
 
@@ -16,6 +16,3 @@ def measure_palette(scene: Scene) -> Measurement:
     style = color_moments(scene.style_image.flatten(1).T)
     distance = 255.0 * float(gaussian_distance(*photos, *style))
     return Measurement(distance >= MIN_DISTANCE, "of 255 between the two palettes", distance, MIN_DISTANCE)
-
-
-PALETTE = Effect("palette", measure_palette, source="style image")

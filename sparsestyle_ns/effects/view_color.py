@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsestyle_ns.effects.base import Effect, Measurement
+from sparsestyle_ns.effects.base import Measurement
 from sparsestyle_ns.effects.exposure import DARK, fit_gains, not_measurable
 from sparsestyle_ns.effects.scene import Scene
 
@@ -29,6 +29,3 @@ def measure_view_color(scene: Scene) -> Measurement:
         words += f", but {num_views} photos are too few to tell shine from shape; {MIN_VIEWS} are needed"
         on = False
     return Measurement(on, words, share, MIN_SHARE)
-
-
-VIEW_COLOR = Effect("view_color", measure_view_color)

@@ -232,7 +232,6 @@ def test_the_table_has_a_line_for_every_effect_in_order(made):
     decisions = decide(made("blender", *OBJECT), EffectSettings())
     lines = decisions.text().splitlines()
     assert [line.split()[0] for line in lines] == ["effect", *EFFECTS]
-    assert len(decisions.markdown().splitlines()) == len(EFFECTS) + 2
 
 
 def test_the_settings_are_the_effects_in_order():
