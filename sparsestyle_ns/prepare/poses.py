@@ -30,14 +30,7 @@ def fits(photo: Size, pose: Size) -> bool:
 
 
 class LLFFPoses:
-    """Poses of a photo set in `poses_bounds.npy`: one row a photo, in the order of their names.
-
-    Args:
-        path: the file.
-
-    Raises:
-        InputError: it can't be used.
-    """
+    """Poses of a photo set in `poses_bounds.npy`: one row a photo, in the order of their names."""
 
     parser = "llff-data"
     """The dataparser that reads what `write` writes."""
@@ -48,11 +41,7 @@ class LLFFPoses:
         self.rows = np.load(path).astype(np.float64)
 
     def photos(self, found: Sequence[Path]) -> List[Path]:
-        """Those of the photos that have poses, in the poses' order.
-
-        Raises:
-            InputError: there are too few, or it isn't clear which pose is whose.
-        """
+        """Those of the photos that have poses; an `InputError` if too few, or if it isn't clear which pose is whose."""
         if len(found) != len(self.rows):
             raise InputError(
                 f"There are {len(found)} photos, but {self.path} has {len(self.rows)} poses; keep exactly one photo "
@@ -119,11 +108,7 @@ class TransformsPoses:
         return {**frames, **self._matched([path for path in found if path.stem not in settled], lambda path: path.stem)}
 
     def _matched(self, found: Sequence[Path], key: Callable[[Path], str]) -> Dict[Path, Dict[str, Any]]:
-        """Photos with their frames, of which keys agree.
-
-        Raises:
-            InputError: a photo's key is that of several frames, or a frame's of several photos.
-        """
+        """Photos with their frames, of which keys agree: an `InputError` if with more than one."""
         frames: Dict[str, List[Dict[str, Any]]] = {}
         for frame in self.content["frames"]:
             frames.setdefault(key(self.path.parent / frame["file_path"]), []).append(frame)
@@ -146,11 +131,7 @@ class TransformsPoses:
         return {path: frames[name][0] for name, path in owners.items()}
 
     def _splits(self, names: Sequence[str]) -> Dict[str, List[str]]:
-        """The file's lists of photos to train on and to hold out, as far as they are used, with new names.
-
-        Args:
-            names: the new name of each frame in use.
-        """
+        """The file's lists of photos to train on and to hold out, with the new name of each frame in use."""
         if not any(split in self.content for split in SPLITS):
             return {}
         renamed = {Path(frame["file_path"]): name for frame, name in zip(self.used, names, strict=True)}
@@ -196,11 +177,7 @@ Poses = Union[LLFFPoses, TransformsPoses]
 
 
 def find_poses(photos: Path) -> Optional[Poses]:
-    """The poses in the folder of the photos or, for a folder `images`, in the one around it; None if there are none.
-
-    Raises:
-        InputError: they can't be used.
-    """
+    """The poses in the folder of the photos or, for a folder `images`, in the one around it; None if there are none."""
     for folder in (photos, photos.parent) if photos.name.startswith("images") else (photos,):
         if (folder / POSES_BOUNDS).is_file():
             return LLFFPoses(folder / POSES_BOUNDS)

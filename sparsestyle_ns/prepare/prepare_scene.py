@@ -45,7 +45,6 @@ def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> Pr
     with the photos is printed, a line each, and stops nothing.
 
     Args:
-        photos: their folder.
         output: the scene's folder; must not be there yet, or be empty.
         source: where poses are from: a file beside the photos, COLMAP, or whichever of the two there is, in this order.
 
@@ -95,9 +94,6 @@ def _read_for_pose(path: Path, poses: Optional[Poses], index: int) -> Photo:
 
     COLMAP and the readers of poses_bounds.npy and transforms.json take pixels as they are stored, whatever EXIF says,
     so a pose from a file is for these; for the upright photo only where its shape leaves no other choice.
-
-    Raises:
-        InputError: its shape is not that of its pose.
     """
     if poses is None:
         return read_photo(path)
@@ -152,16 +148,11 @@ def run_colmap(photos: Path, scene: Path, originals: Sequence[str], findings: Se
     """Has COLMAP find the poses, by way of ns-process-data, which writes the scene.
 
     Args:
-        photos: folder of the photos, of one size.
-        scene: folder to write.
         originals: the photos' own names, in the order of those in the folder.
         findings: what is wrong with the photos.
 
     Returns:
-        File names of the photos that have a pose.
-
-    Raises:
-        InputError: COLMAP found the place of fewer than three photos.
+        File names in the scene of the photos that have a pose: at least three, else there is an `InputError`.
     """
     put_ffmpeg_on_path()
     program = shutil.which("ns-process-data") or str(Path(sys.executable).with_name("ns-process-data"))
