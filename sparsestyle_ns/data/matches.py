@@ -78,11 +78,9 @@ class _View:
 
 
 def match_points(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras) -> PointMatches:
-    """Finds points that two photos see; only where both photos are opaque, and by cameras that are `LENSES`.
+    """Points that two RGBA photos in [0, 1] see; only where both are opaque, and by cameras that are `LENSES`.
 
-    Args:
-        photos: RGBA in [0, 1].
-        cameras: one for each, for images of any size with the same aspect.
+    Cameras are one for each photo, for images of any size with the same aspect.
     """
     poses = cameras.camera_to_worlds.double().numpy()
     seen = [_look_at(photo, cameras, index) for index, photo in enumerate(photos)]
@@ -189,8 +187,7 @@ def epipolar_error(
     first: PixelRays, second: PixelRays, pose_first: Float[np.ndarray, "3 4"], pose_second: Float[np.ndarray, "3 4"]
 ) -> Float[np.ndarray, "matches"]:
     """Sampson's distance of matches from the epipolar geometry of two camera-to-world poses, in focal lengths (Hartley
-    and Zisserman, Multiple View Geometry, Eq. 11.9; a fisheye's gradient is over its own image points).
-    """
+    and Zisserman, Multiple View Geometry, Eq. 11.9; a fisheye's gradient is over its own image points)."""
     rotation = pose_second[:, :3].T @ pose_first[:, :3]
     x, y, z = pose_second[:, :3].T @ (pose_first[:, 3] - pose_second[:, 3])
     essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation

@@ -33,7 +33,6 @@ def parse_dataparser(words: Sequence[str], data: Path) -> DataParserConfig:
 
     Args:
         words: such as `["colmap", "--colmap-path", "sparse/0"]`.
-        data: the scene's folder or file.
 
     Raises:
         InputError: there is no such dataparser or scene, or nothing tells which dataparser reads it.

@@ -32,7 +32,6 @@ def open_photo(path: Path, draft: bool = False) -> Image.Image:
     """Reads a photo whole.
 
     Args:
-        path: the image file.
         draft: whether a JPEG may come at its smallest size, which is fast and still finds that it is cut short.
 
     Raises:

@@ -20,11 +20,6 @@ def _check_blender_files(config: BlenderDataParserConfig, split: str) -> None:
     open_photo(config.data / f"{first}.png")  # it gives all cameras their size
 
 
-def _check_nerfstudio_files(config: NerfstudioDataParserConfig) -> None:
-    is_file = config.data.suffix == ".json"
-    read_transforms(config.data if is_file else config.data / "transforms.json", with_angle=False)
-
-
 def read_scene(parser: DataParser, split: str = "train") -> DataparserOutputs:
     """One split of a scene, checked, with its `SceneInfo` in the metadata.
 
@@ -35,7 +30,8 @@ def read_scene(parser: DataParser, split: str = "train") -> DataparserOutputs:
     if isinstance(config, BlenderDataParserConfig):
         _check_blender_files(config, split)
     if isinstance(config, NerfstudioDataParserConfig):
-        _check_nerfstudio_files(config)
+        is_file = config.data.suffix == ".json"
+        read_transforms(config.data if is_file else config.data / "transforms.json", with_angle=False)
     try:
         outputs = parser.get_dataparser_outputs(split)
     except InputError:

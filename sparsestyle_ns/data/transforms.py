@@ -20,7 +20,6 @@ def read_transforms(path: Path, with_angle: bool) -> Dict[str, Any]:
     """What a `transforms….json` holds, in which every frame names a photo and has a camera pose.
 
     Args:
-        path: the file.
         with_angle: whether it must have `camera_angle_x`, the horizontal angle of view in radians.
 
     Raises:
@@ -45,11 +44,7 @@ def read_transforms(path: Path, with_angle: bool) -> Dict[str, Any]:
 
 
 def check_lenses(path: Path, content: Dict[str, Any]) -> None:
-    """Makes sure that what `read_transforms` read of lenses and sizes, of all cameras or of one, is numbers.
-
-    Raises:
-        InputError: something isn't a number, or none that a camera can have.
-    """
+    """Raises an `InputError` if what `read_transforms` read of a lens or size is no number that a camera can have."""
     frames = [(f"frame {index} (from 0) of {path}", frame) for index, frame in enumerate(content["frames"])]
     for where, given in [(str(path), content), *frames]:
         for key in LENGTHS:

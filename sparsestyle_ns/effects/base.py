@@ -11,7 +11,6 @@ from typing import Any, Dict, List, Literal, Optional, Tuple
 from sparsestyle_ns.utils.errors import InputError
 
 EffectChoice = Literal["auto", "on", "off"]
-FILE_NAME = "effects.json"
 
 
 @dataclass(frozen=True)
@@ -94,6 +93,10 @@ class Decisions:
         """Whether an effect is simulated."""
         return self[name].on
 
+    def replaced(self, decision: Decision) -> "Decisions":
+        """The same decisions but one."""
+        return Decisions(tuple(decision if item.name == decision.name else item for item in self.items))
+
     def records(self) -> List[Dict[str, Any]]:
         """The decisions as plain values, for JSON and checkpoints."""
         return [asdict(item) for item in self.items]
@@ -105,7 +108,7 @@ class Decisions:
 
     def save(self, folder: Path) -> None:
         """Writes `effects.json` into a run's folder."""
-        (folder / FILE_NAME).write_text(self.json(), encoding="utf-8")
+        (folder / "effects.json").write_text(self.json(), encoding="utf-8")
 
     def json(self) -> str:
         """The decisions as JSON: a list `effects` of name, on, measured, threshold, reason, …"""

@@ -5,22 +5,17 @@ from typing import Callable, Dict, Literal, NamedTuple, Optional
 from sparsestyle_ns.effects.background import measure_background
 from sparsestyle_ns.effects.base import Decision, Decisions, EffectChoice, EffectSettings, Measurement
 from sparsestyle_ns.effects.coarse_geometry import measure_empty_space, measure_residual_density
-from sparsestyle_ns.effects.exposure import measure_exposure
 from sparsestyle_ns.effects.layouts import measure_box, measure_contraction, measure_forward_facing
 from sparsestyle_ns.effects.lens_distortion import measure_lens_distortion
+from sparsestyle_ns.effects.matched_colors import measure_exposure, measure_view_color
 from sparsestyle_ns.effects.matched_depth import measure_matched_depth
 from sparsestyle_ns.effects.palette import measure_palette
 from sparsestyle_ns.effects.scene import Scene
-from sparsestyle_ns.effects.view_color import measure_view_color
 from sparsestyle_ns.utils.errors import InputError
 
 
 class Effect(NamedTuple):
-    """What is measured of a scene for an effect.
-
-    Attributes:
-        source: what that is. Effects of the photos are decided before stage 1, and stage 2 takes them over.
-    """
+    """How a scene is measured for an effect. Those of the photos are decided before stage 1, and stage 2 keeps them."""
 
     measure: Callable[[Scene], Measurement]
     source: Literal["photos", "coarse field", "style image"] = "photos"
@@ -68,10 +63,7 @@ def decide(scene: Scene, settings: EffectSettings, inherited: Optional[Decisions
 def decide_again(decisions: Decisions, name: str, scene: Scene) -> Decisions:
     """Decides anew about one effect, now that more of the scene is known; not where the command line set it."""
     choice = decisions[name].choice
-    if choice != "auto":
-        return decisions
-    anew = _settle(name, EFFECTS[name].measure(scene), choice)
-    return Decisions(tuple(anew if item.name == name else item for item in decisions.items))
+    return decisions if choice != "auto" else decisions.replaced(_settle(name, EFFECTS[name].measure(scene), choice))
 
 
 def decided_on_photos(decisions: Decisions) -> Dict[str, bool]:

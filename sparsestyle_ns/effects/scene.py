@@ -97,8 +97,3 @@ def border(photo: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "pixels C"]:
     rim = max(1, round(BORDER * max(height, width)))
     inside[rim:-rim, rim:-rim] = True
     return photo[~inside]
-
-
-def foreground_colors(scene: Scene) -> Float[Tensor, "pixels 3"]:
-    """Colours of all photos' opaque pixels."""
-    return torch.from_numpy(np.concatenate([photo[photo[..., 3] > 0.5][:, :3] for photo in scene.photos]))

@@ -1,4 +1,4 @@
-"""Camera poses that lie beside photos, brought to the photos' new size."""
+"""Camera poses that lie beside photos, the photos that they are for, and the poses at the photos' new size."""
 
 import json
 import math
@@ -10,7 +10,7 @@ import numpy as np
 
 from sparsestyle_ns.data.llff import read_poses_bounds
 from sparsestyle_ns.data.transforms import check_lenses, read_transforms
-from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, Size
+from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, Photo, Size, read_photo
 from sparsestyle_ns.utils.errors import InputError
 
 POSES_BOUNDS, TRANSFORMS = "poses_bounds.npy", "transforms.json"
@@ -184,3 +184,39 @@ def find_poses(photos: Path) -> Optional[Poses]:
         if (folder / TRANSFORMS).is_file():
             return TransformsPoses(folder / TRANSFORMS)
     return None
+
+
+def read_for_pose(path: Path, poses: Optional[Poses], index: int) -> Photo:
+    """A photo as its pose is for it: upright where it has none yet.
+
+    COLMAP and the readers of poses_bounds.npy and transforms.json take pixels as they are stored, whatever EXIF says,
+    so a pose from a file is for these; for the upright photo only where its shape leaves no other choice.
+    """
+    if poses is None:
+        return read_photo(path)
+    stored, expected = read_photo(path, upright=False), poses.size(index)
+    if expected is None or fits(stored.image.size, expected):
+        return stored
+    turned = read_photo(path)
+    if fits(turned.image.size, expected):
+        return turned
+    width, height = stored.image.size
+    raise InputError(
+        f"{path} is {width} × {height} pixels, which is no scaled version of the {expected[0]} × {expected[1]} that "
+        f"its pose in {poses.path} is for; use the photo that the pose was found with."
+    )
+
+
+def say_what_is_turned(photos: Sequence[Photo], poses: Optional[Poses]) -> None:
+    """Prints what was done with photos that aren't stored upright, a line for each way."""
+    told: Dict[str, List[str]] = {}
+    for photo in photos:
+        words = "turned upright, as EXIF says"
+        if not photo.upright:
+            words = f"not turned, though EXIF says so, since poses in {poses.path} are for photos as they are stored"
+        elif poses is not None:
+            words += f", since only then the shape is that of the pose in {poses.path}"
+        if photo.orientation != 1:
+            told.setdefault(words, []).append(photo.path.name)
+    for words, names in told.items():
+        print(f"{', '.join(names)}: {words}")
