@@ -1,4 +1,4 @@
-"""`sparsestyle compare` and `ablate`: the runs that the paper sets side by side (Tab. 1, Sec. 4.2), and what is shown."""
+"""`sparsestyle compare` and `ablate`: the runs that the paper sets side by side (Tab. 1, Sec. 4.2), and their page."""
 
 import shlex
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ from sparsestyle_ns.studies.study_options import StudyOptions
 from sparsestyle_ns.studies.study_page import Captioned, Plot, Section, study_page
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.page import prepare_page, write_page
+from sparsestyle_ns.utils.files import prepare_output, write_output
 
 PAPER_ROWS: Dict[str, Tuple[float, ...]] = {
     "AdaIN": (0.189, 0.618, 0.276, 0.231, 0.601, 0.295),
@@ -272,7 +272,7 @@ def check_options(options: StudyOptions) -> PaperRuns:
         raise InputError(f"--jobs is {options.jobs}; at least one run at a time is needed.")
     for painting in options.style_images:
         Painting.read(painting)
-    prepare_page(options.output_path)
+    prepare_output(options.output_path, "The page", "index.html")
     named = ("draft", "max_image_side", "coarse_iterations", "style_iterations")
     flags = {name: tuple(shlex.split(getattr(options, name))) for name in ("coarse_flags", "style_flags")}
     study = Study(options.data, dataparser, **{name: getattr(options, name) for name in named}, **flags)
@@ -289,4 +289,5 @@ def _run_study(
     for section in sections:
         for table in section.tables:
             table.print()
-    return write_page(study_page(f"{title}: {runs.study.name}", sections), options.output_path)
+    page = study_page(f"{title}: {runs.study.name}", sections)
+    return write_output(options.output_path, page, "The page", "index.html")
