@@ -110,7 +110,6 @@ class Point:
     moment: str = ""
     """When in a run it was measured, in words; empty where there is no run."""
     values: Dict[str, List[float]] = field(default_factory=dict)
-    """Every repetition of every metric."""
     busy: bool = False
     """Whether other processes kept the machine busy during any of them."""
 

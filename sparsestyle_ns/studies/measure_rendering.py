@@ -15,7 +15,6 @@ from torch import Tensor
 
 from sparsestyle_ns.core.occupancy import Occupancy
 from sparsestyle_ns.core.precision import Precision, autocast, multiplies_bfloat16, multiplies_tf32
-from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.rendering.baked import BakedVolume, render_baked
@@ -34,7 +33,6 @@ CONVERGED = 16
 REFERENCE_SHARE = 0.4
 """Part of the time that the converged render may take; the number of rays follows from it."""
 MIN_RAYS, MAX_RAYS = 64, 4096
-PROBE_RAYS = 64
 FACTORS = (1 / 8, 1 / 4, 1 / 2, 1, 2)
 """Numbers of samples, as multiples of the preset's."""
 MIN_ALPHAS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3)
@@ -86,9 +84,9 @@ def altered(thing: object, **values: object) -> Iterator[None]:
             setattr(thing, name, value)
 
 
-def multiples(preset: int) -> Tuple[int, ...]:
+def multiples(preset: int) -> List[int]:
     """The numbers of samples to measure, ascending."""
-    return tuple(sorted({max(2, round(preset * factor)) for factor in FACTORS}))
+    return sorted({max(2, round(preset * factor)) for factor in FACTORS})
 
 
 def quadrature_plans(bench: Workbench) -> List[Plan]:
@@ -98,16 +96,15 @@ def quadrature_plans(bench: Workbench) -> List[Plan]:
     of empty cells, which training never visits, means nothing, and a render that skips nothing would show it.
     """
 
-    def curve(config: SparseStyleTrainerConfig, setting: str, name: str, title: str) -> Curve:
-        return setting_curve(config, f"pipeline.model.{setting}", "quadrature", name, title, [("view_seconds", "rmse")])
-
-    coarse, style = bench.coarse_config, bench.style_config
-    samples = curve(coarse, "num_eval_samples", "samples", "Samples a ray of the coarse field")
-    marching = [
-        curve(style, "num_steps", "steps", "Steps along a ray of the stylised field"),
-        curve(style, "min_alpha", "skipping", "Opacity below which cells are skipped"),
-        curve(style, "min_transmittance", "stopping", "Light left at which a ray ends"),
-    ]
+    samples, *marching = (
+        setting_curve(config, f"pipeline.model.{setting}", "quadrature", name, title, [("view_seconds", "rmse")])
+        for config, setting, name, title in (
+            (bench.coarse_config, "num_eval_samples", "samples", "Samples a ray of the coarse field"),
+            (bench.style_config, "num_steps", "steps", "Steps along a ray of the stylised field"),
+            (bench.style_config, "min_alpha", "skipping", "Opacity below which cells are skipped"),
+            (bench.style_config, "min_transmittance", "stopping", "Light left at which a ray ends"),
+        )
+    )
     return [
         Plan([samples], 3, lambda budget: _measure_samples(bench, samples, budget)),
         Plan(marching, 9, lambda budget: _measure_marching(bench, *marching, budget)),
@@ -164,7 +161,7 @@ def _sweep(
         count = getattr(model.config, samples)
         return in_chunks(bundle, count, budget, lambda part: model.get_outputs(part)[output])
 
-    probe = bench.some_rays(PROBE_RAYS)
+    probe = bench.some_rays(MIN_RAYS)
     render(probe)
     seconds_a_ray = bench.timed(lambda: render(probe))[0] / len(probe) * converged / preset
     fitting = int(REFERENCE_SHARE * budget.left / max(seconds_a_ray, 1e-12))

@@ -3,7 +3,7 @@
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Dict, List, Mapping, Optional, Sequence, Tuple
+from typing import Dict, List, Mapping, Sequence, Tuple
 
 from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.engine.hints import finish
@@ -188,14 +188,14 @@ def _measure_2d(folder: Path, measure: PaintingMeasure) -> Dict[str, RunFigures]
 
 def consistency_table(measured: Mapping[str, RunFigures], with_paper: bool) -> Table:
     """Consistency of each row, of the unstylised scene of ours, and of the paper's rows."""
-    rows: List[Tuple[str, Dict[str, Optional[float]]]] = [(name, row.figures) for name, row in measured.items()]
-    prefix = "ceiling_"
-    ceiling = {k.removeprefix(prefix): v for k, v in measured["ours"].figures.items() if k.startswith(prefix)}
-    rows.append(("the unstylised scene of ours (the ceiling)", ceiling))
+    ours, prefix = measured["ours"].figures, "ceiling_"
+    ceiling = {key.removeprefix(prefix): value for key, value in ours.items() if key.startswith(prefix)}
+    rows = {name: row.figures for name, row in measured.items()}
+    rows["the unstylised scene of ours (the ceiling)"] = ceiling
     paper = PAPER_ROWS if with_paper else {}
     cited = {f"the paper's {name}": dict(zip(PAPER_KEYS, values, strict=True)) for name, values in paper.items()}
     title, note = "Consistency between frames t and t + 1 (short), t and t + 7 (long)", PAPER_NOTE if with_paper else ""
-    table = table_of(title, consistency_columns(), [*rows, *cited.items()], note)
+    table = table_of(title, consistency_columns(), [*rows.items(), *cited.items()], note)
     table.cited = tuple(cited)
     return table
 

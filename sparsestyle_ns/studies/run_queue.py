@@ -31,7 +31,6 @@ TRAINING_PROCESS = (sys.executable, "-m", "sparsestyle_ns.studies.run_queue")
 CORES_PER_JOB = 4
 """CPU cores that a run makes good use of."""
 SECONDS_BETWEEN_LOOKS = 2.0
-"""At how far a run is."""
 PICTURE_SIDE = 256
 """Longer side, in pixels, of pictures of a run on its way."""
 Settings = Mapping[str, object]
@@ -46,7 +45,6 @@ class Run:
     output_dir: Path
     """What `ns-train --output-dir` names."""
     name: str
-    """Part of the run's folder."""
     stage: Stage
     settings: Tuple[Tuple[str, object], ...] = ()
     """`Settings` beside the preset's, as pairs."""

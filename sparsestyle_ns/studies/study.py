@@ -19,10 +19,7 @@ C = TypeVar("C")
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """A scene and the presets of both stages on it; what is None is as in the preset.
-
-    Flags are those of ns-train, for all runs of each stage; they win over all settings.
-    """
+    """A scene and the presets of both stages on it, with None for what is as there; flags win over all settings."""
 
     data: Path
     dataparser: DataParserConfig

@@ -24,7 +24,6 @@ class Section:
     heading: str
     text: str = ""
     lines: Sequence[str] = ()
-    """A list below the text."""
     tables: Sequence[Table] = ()
     plots: Sequence[Plot] = ()
     grid: Sequence[Tuple[str, Captioned]] = ()
@@ -32,7 +31,6 @@ class Section:
     note: str = ""
     """A paragraph below all, in small type."""
     facts: Dict[str, str] = field(default_factory=dict)
-    """What it depends on, by name."""
     parts: Sequence["Section"] = ()
 
 

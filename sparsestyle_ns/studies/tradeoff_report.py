@@ -12,7 +12,7 @@ from typing import Dict, Iterator, List, Mapping, Optional, Sequence, Union
 
 from sparsestyle_ns.evaluation.tables import Table
 from sparsestyle_ns.studies.advice import recommendation
-from sparsestyle_ns.studies.curves import METRICS, Curve, Point
+from sparsestyle_ns.studies.curves import METRICS, Curve, Point, Spread
 from sparsestyle_ns.studies.plots import curve_plot, overview
 from sparsestyle_ns.studies.study_options import Group
 from sparsestyle_ns.studies.study_page import Section, study_page
@@ -29,10 +29,7 @@ GROUPS: Dict[Group, str] = {
     "precision": "Precision",
 }
 """In the order of the page."""
-COLUMNS = (
-    *("axis", "flag", "setting", "moment", "metric"),
-    *("median", "low", "high", "count", "front", "recommended", "busy"),
-)
+COLUMNS = ("axis", "flag", "setting", "moment", "metric", *Spread._fields, "front", "recommended", "busy")
 LEGEND = (
     "Figures are medians, with the smallest and largest of as many repetitions as are named. A ring marks the "
     "recommended point, the dashed line is the Pareto front: no other point is as fast and as accurate. Hollow points, "
@@ -46,7 +43,6 @@ class Report:
     """All that was found."""
 
     scene: str
-    """In words."""
     facts: Dict[str, Fact]
     """What figures depend on, by name."""
     curves: List[Curve]
