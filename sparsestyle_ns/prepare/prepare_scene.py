@@ -16,7 +16,7 @@ from sparsestyle_ns.prepare.diagnosis import check_photos
 from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, find_photos, frame_photos, write_photos
 from sparsestyle_ns.prepare.poses import TRANSFORMS, find_poses, read_for_pose, say_what_is_turned
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.ffmpeg import put_ffmpeg_on_path
+from sparsestyle_ns.utils.machine import put_ffmpeg_on_path
 
 PoseSource = Literal["auto", "file", "colmap"]
 
