@@ -17,7 +17,6 @@ from sparsestyle_ns.utils.progress import say
 PAINTING = "PAINTING.jpg"
 """Stands for a painting that the person at the keyboard has to name."""
 RESUMING = ("--load-dir", "--load-checkpoint", "--load-step")
-"""Flags that say where training goes on."""
 
 
 def finish(made: Union[Path, str, None], command: Sequence[object]) -> None:
@@ -48,8 +47,8 @@ def after_effects(
     """What follows on `sparsestyle effects`, from its arguments."""
     command = ["ns-train", COARSE_METHOD]
     if coarse_run is not None:
-        command = ["ns-train", STYLE_METHOD, "--style-image", str(style_image or PAINTING)]
-        command += ["--coarse-run", str(coarse_run)]
+        painting = str(style_image or PAINTING)
+        command = ["ns-train", STYLE_METHOD, "--style-image", painting, "--coarse-run", str(coarse_run)]
     command += _flag("--num-views", num_views) + _flag("--view-ids", view_ids)
     return [*command, "--data", str(data), *_parser(dataparser)]
 
@@ -98,11 +97,7 @@ def _flag(name: str, value: Any, usual: Any = None) -> List[str]:
 
 
 def resume_command(method: str, checkpoints: Path, typed: Optional[Sequence[str]] = None) -> List[str]:
-    """The command that was typed to train a method, going on from a folder of checkpoints.
-
-    Args:
-        typed: its arguments; None: this process's own.
-    """
+    """The command that trains a method on from a folder of checkpoints, otherwise as it was `typed` (None: here)."""
     typed = sys.argv[1:] if typed is None else list(typed)
     if method not in typed:  # training was begun by something else than ns-train
         return ["ns-train", method, "--load-dir", str(checkpoints)]

@@ -3,11 +3,16 @@
 from pathlib import Path
 from typing import NamedTuple, Optional
 
+from sparsestyle_ns.engine.evaluate_options import EvaluateOptions
+from sparsestyle_ns.engine.hints import after_evaluation, finish
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.evaluation.held_out import HeldOutReport
+from sparsestyle_ns.evaluation.tables import report_tables
 from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.runs.run_folder import find_config
 from sparsestyle_ns.runs.scene_record import SceneRecord
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 
 
@@ -44,6 +49,21 @@ def load_run(config_path: Path) -> LoadedRun:
 
     config, pipeline, _, step = eval_setup(config_path, test_mode="test", update_config_callback=where_it_is_now)
     return LoadedRun(config, pipeline, step)
+
+
+def evaluate(options: EvaluateOptions) -> None:
+    """Measures a run, writes the report, and prints its tables; the options are checked.
+
+    Raises:
+        InputError: the run has no checkpoint, or the painting can't be read.
+    """
+    if options.style_image is not None:
+        Painting.read(options.style_image)
+    config = find_config(options.run)
+    report = evaluate_run(config, options.output_path, options.style_image, options.baked)
+    for table in report_tables(report.means, len(report.views)):
+        table.print()
+    finish(options.output_path, after_evaluation(config.parent, stylised="content_ssim" in report.means))
 
 
 def evaluate_run(

@@ -16,10 +16,10 @@ from sparsestyle_ns.utils.progress import say
 
 
 def preview_steps(shares: Sequence[float], total: int) -> FrozenSet[int]:
-    """The numbers of iterations, of `total`, after which a preview is due, from shares of them in (0, 1].
+    """After which iterations, of `total`, a preview is due, by shares of them.
 
     Raises:
-        InputError: a share isn't in that range.
+        InputError: a share isn't in (0, 1].
     """
     for share in shares:
         if not 0.0 < share <= 1.0:
@@ -29,9 +29,9 @@ def preview_steps(shares: Sequence[float], total: int) -> FrozenSet[int]:
 
 @torch.no_grad()
 def render_preview(pipeline: CheckedPipeline, longest_side: int) -> Float[Tensor, "H W 3"]:
-    """The middle one of the held-out views: photo, unstylised render where there is one, and render, side by side.
+    """The middle held-out view, side by side: photo, unstylised render where there is one, and render.
 
-    Rendered exactly, at `longest_side` pixels at most, and without leaving a trace in the state of training.
+    Rendered exactly, at `longest_side` pixels at most; the state of training stays as it is.
     """
     model, dataset = pipeline.model, pipeline.datamanager.eval_dataset
     index = len(dataset) // 2
@@ -50,7 +50,7 @@ def render_preview(pipeline: CheckedPipeline, longest_side: int) -> Float[Tensor
 
 
 def preview_path(run: Path, iterations: int) -> Path:
-    """Where the preview after so many iterations is, in a run's folder."""
+    """Where the preview after so many iterations is in a run's folder."""
     return run / "previews" / f"after-{iterations:06d}.png"
 
 

@@ -1,8 +1,7 @@
 """Another style for a scene whose coarse field is there: the iterations of `ns-train hier-style`, beside a viewer.
 
-What is frozen is shared: the views' rays with the coarse field evaluated along them, photos, the features of those
-whose colours stay, and the feature network. New are a field, the painting's features, and pictures in its colours. The
-model and what is trained or shown meanwhile are only read, so that no lock is held while the field learns.
+What depends on no painting is shared. The model, and what is trained or shown meanwhile, are only read, so that no lock
+is held while the new field learns.
 """
 
 import copy
@@ -56,12 +55,9 @@ class Progress(NamedTuple):
 
 
 class Workshop:
-    """What all restylings of a scene have in common.
+    """What all restylings of a scene have in common, whose run is in a folder.
 
-    Args:
-        pipeline: of the scene.
-        folder: of its run.
-        lock: held while something changes that other threads may use: the random numbers' state.
+    The lock is held while something changes that other threads may use: the random numbers' state.
 
     Raises:
         InputError: several processes train together.
@@ -74,7 +70,7 @@ class Workshop:
         self._backbone: Optional[Backbone] = None
 
     def config(self) -> SparseStyleTrainerConfig:
-        """The run's config, as it is by now; see `read_config`."""
+        """The run's config, as it is by now."""
         return read_config(self.folder)
 
     def backbone(self) -> Backbone:
@@ -96,10 +92,10 @@ class Workshop:
 class Restyling:
     """One restyling, in steps: `for progress in restyling: …`, then `field` (σ_f and c_f) is the new style.
 
-    Args:
-        workshop: of the scene.
-        image: the painting.
-        iterations: how many, at least 1; None: as many as the run had.
+    There are as many iterations as the run had, if their number isn't given.
+
+    Raises:
+        InputError: there is no iteration.
     """
 
     def __init__(self, workshop: Workshop, image: Painting, iterations: Optional[int] = None) -> None:
@@ -108,6 +104,7 @@ class Restyling:
         self.iterations = self.config.max_num_iterations if iterations is None else iterations
         if self.iterations < 1:
             raise InputError(f"A style needs at least 1 iteration, and {self.iterations} were asked for.")
+        self._painting = Path(PAINTING_FOLDER) / safe_file_name(self.image.name, "painting")
         self.field = workshop.new_field()
         self.optimizers = FiniteOptimizers(self.config.optimizers.copy(), {"fields": list(self.field.parameters())})
 
@@ -121,7 +118,7 @@ class Restyling:
             yield Progress("Preparing the views, which the next style won't need")
         task = pipeline.new_task(self.field, targets, self.effects)
         warm_up = pipeline.config.warm_start_steps
-        for step in warm_start(pipeline, task, self.config.optimizers["fields"]["optimizer"].lr):
+        for step in warm_start(pipeline, task, self.optimizers):
             yield Progress(f"Warm start, step {step + 1} of {warm_up}", (step + 1) / (warm_up + total))
         began = time.monotonic()
         for step in range(total):
@@ -166,11 +163,6 @@ class Restyling:
         finally:
             shutil.rmtree(hidden, ignore_errors=True)
 
-    @property
-    def _painting(self) -> Path:
-        """Where the painting lies in a run."""
-        return Path(PAINTING_FOLDER) / safe_file_name(self.image.name, "painting")
-
     def _write_contents(self, new: Path) -> None:
         """Writes a run but for its config."""
         write_whole(new / self._painting, self.image.data)
@@ -180,9 +172,9 @@ class Restyling:
                 shutil.copy(self.workshop.folder / name, new / name)
         self.effects.save(new)
         own = {f"_model.residual.{name}": value for name, value in self.field.state_dict().items()}
-        step = self.iterations - 1
-        path = checkpoint_path(new / self.config.relative_model_dir, step)
-        write_checkpoint(path, step, {**self.pipeline.state_dict(), **own}, self.optimizers, self.notes())
+        path = checkpoint_path(new / self.config.relative_model_dir, self.iterations - 1)
+        state = {**self.pipeline.state_dict(), **own}
+        write_checkpoint(path, self.iterations - 1, state, self.optimizers, self.notes())
 
     def _write_config(self, new: Path, folder: Path) -> None:
         """Writes the config of a run that will lie in `folder`."""

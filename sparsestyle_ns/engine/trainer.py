@@ -13,7 +13,6 @@ from typing import Any, ClassVar, Dict, List, Literal, Optional, Tuple, Type
 import torch
 import yaml
 from nerfstudio.configs.base_config import MachineConfig
-from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import comms, writer
 from nerfstudio.utils.decorators import check_main_thread, check_viewer_enabled
@@ -26,13 +25,8 @@ from sparsestyle_ns.engine.previews import preview_steps, render_preview, save_p
 from sparsestyle_ns.engine.training import check_skipped, training_step
 from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
-from sparsestyle_ns.runs.checkpoints import (
-    CheckpointNotes,
-    checkpoint_path,
-    load_checkpoint,
-    newest_checkpoint,
-    write_checkpoint,
-)
+from sparsestyle_ns.runs import checkpoints
+from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path
 from sparsestyle_ns.runs.scene_record import record_scene
 from sparsestyle_ns.utils.distributed import any_process, prepare_launch, share_state
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
@@ -42,7 +36,6 @@ from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 
 STEPS_PER_LOOK = 10
 """Iterations between looks at the count of skipped steps, each of which waits for a GPU."""
-
 
 warnings.filterwarnings("ignore", message="Using a non-tuple sequence", module="nerfstudio")
 warnings.filterwarnings("ignore", message="Sparse invariant checks are implicitly disabled")
@@ -74,10 +67,10 @@ class SparseStyleTrainerConfig(TrainerConfig):
         """Writes config.yml into the run's folder; `ns-train` calls it right before it starts processes."""
         gpus = torch.cuda.device_count()
         if self.machine.device_type == "cuda" and self.machine.num_devices > gpus:
+            advice = "ask for fewer." if gpus else "give --machine.device-type cpu."
             raise InputError(
                 f"--machine.device-type is cuda and --machine.num-devices {self.machine.num_devices}, but torch finds "
-                f"{gpus or 'no'} GPU{'s' * (gpus > 1)} here; "
-                + ("ask for fewer." if gpus else "give --machine.device-type cpu.")
+                f"{gpus or 'no'} GPU{'s' * (gpus > 1)} here; {advice}"
             )
         if self.machine.num_devices * self.machine.num_machines > 1:
             prepare_launch()
@@ -118,7 +111,7 @@ class SparseStyleTrainer(Trainer, ABC):
             record_scene(manager.config.data, manager.train_dataparser_outputs, effects).save(self.base_dir)
             self._save_decisions()
 
-    def setup_optimizers(self) -> Optimizers:
+    def setup_optimizers(self) -> FiniteOptimizers:
         """Optimisers that skip steps whose gradient isn't finite."""
         return FiniteOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
 
@@ -132,7 +125,7 @@ class SparseStyleTrainer(Trainer, ABC):
     def resumed(self) -> Optional[Dict[str, Any]]:
         """What is in the checkpoint that training goes on from, until it is loaded; None for a new run."""
         checkpoint = self._resumed_checkpoint()
-        return None if checkpoint is None else load_checkpoint(checkpoint)
+        return None if checkpoint is None else checkpoints.load_checkpoint(checkpoint)
 
     def _resumed_checkpoint(self) -> Optional[Path]:
         for source in (self.config.load_dir, self.config.load_checkpoint):
@@ -143,14 +136,13 @@ class SparseStyleTrainer(Trainer, ABC):
         folder, step = self.config.load_dir, self.config.load_step
         if folder is None:
             return self.config.load_checkpoint
-        checkpoint = newest_checkpoint(folder) if step is None else checkpoint_path(folder, step)
+        checkpoint = checkpoints.newest_checkpoint(folder) if step is None else checkpoint_path(folder, step)
         if checkpoint is None or not checkpoint.is_file():
             what = "checkpoint" if step is None else f"checkpoint of iteration {step}"
             raise InputError(f"There is no {what} in {folder}; name a run's nerfstudio_models folder.")
         return checkpoint
 
     def _load_checkpoint(self) -> None:
-        """Takes over all of a checkpoint, as nerfstudio does."""
         state = self.resumed
         if state is not None:
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
@@ -169,10 +161,11 @@ class SparseStyleTrainer(Trainer, ABC):
         self.train_to_end()
         self.finish()
 
-    def train_to_end(self) -> None:
+    def train_to_end(self) -> bool:
         """Trains up to `max_num_iterations`, counted from the very first iteration, also when resuming.
 
         Ctrl-C ends training after the iteration that is under way and saves a checkpoint; a second one stops at once.
+        Returns whether training came to its end.
         """
         total = self.config.max_num_iterations
         if self._start_step >= total:
@@ -193,6 +186,7 @@ class SparseStyleTrainer(Trainer, ABC):
             CONSOLE.print(f"Stopped after iteration {self.step + 1} of {total}; the checkpoint is saved.")
         finally:
             signal.signal(signal.SIGINT, former)
+        return not self._interrupted
 
     def _after_train(self) -> None:
         self._bars.close()  # a viewer may stay open for hours after training
@@ -202,7 +196,7 @@ class SparseStyleTrainer(Trainer, ABC):
 
     @check_viewer_enabled
     def _train_complete_viewer(self) -> None:
-        """The viewer stays until Ctrl-C, with which the command ends as well as without a viewer."""
+        """The viewer stays until Ctrl-C, which ends the command as if there were none."""
         self.finish()
         try:
             super()._train_complete_viewer()
@@ -227,8 +221,8 @@ class SparseStyleTrainer(Trainer, ABC):
                 _, losses, metrics = self.pipeline.get_train_loss_dict(step)
             return losses
 
-        accumulate = self.gradient_accumulation_steps
-        loss = training_step(self.optimizers, compute_losses, step, self.grad_scaler, accumulate)
+        scaling = self.grad_scaler, self.gradient_accumulation_steps
+        loss = training_step(self.optimizers, compute_losses, step, *scaling)
         self._log_step(step, metrics)
         self.stop_training = step + 1 == self.config.max_num_iterations  # nerfstudio counts from where it resumed
         return loss, losses, metrics
@@ -251,10 +245,8 @@ class SparseStyleTrainer(Trainer, ABC):
         """Reports steps that were skipped since the last look; returns how many were in a row up to now."""
         total = self.optimizers.skipped().total
         if total > self._reported:
-            CONSOLE.print(
-                f"Steps skipped up to iteration {step + 1}, because their gradients weren't finite: "
-                f"{total - self._reported} ({total} in all)."
-            )
+            new = f"{total - self._reported} ({total} in all)"
+            CONSOLE.print(f"Steps skipped up to iteration {step + 1}, because their gradients weren't finite: {new}.")
             writer.put_scalar(name="Skipped Steps", scalar=total, step=step)
             self._reported = total
         kept = "No checkpoint was saved before."
@@ -265,19 +257,15 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def eval_iteration(self, step: int) -> None:
         """What nerfstudio evaluates after an iteration, and the preview after some; then Ctrl-C ends training."""
-        if step + 1 in self._preview_steps:
-            self._write_preview(step + 1)
+        if step + 1 in self._preview_steps and comms.is_main_process():
+            picture = render_preview(self.pipeline, self.config.preview_side)
+            writer.put_image(name="Preview", image=picture, step=step + 1)
+            save_preview(picture, self.base_dir, step + 1)
         super().eval_iteration(step)
         # Not before: what callbacks decide after an iteration wouldn't be in the checkpoint.
         self._interrupted = any_process(self._interrupted, self.pipeline.device)
         if self._interrupted:
             raise TrainingInterruptedError
-
-    @check_main_thread
-    def _write_preview(self, iterations: int) -> None:
-        picture = render_preview(self.pipeline, self.config.preview_side)
-        writer.put_image(name="Preview", image=picture, step=iterations)
-        save_preview(picture, self.base_dir, iterations)
 
     def finish(self) -> None:
         """Prints the command's last line."""
@@ -297,10 +285,9 @@ class SparseStyleTrainer(Trainer, ABC):
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Saves a checkpoint as nerfstudio does, but only whole and finite ones, and drops the former one after that.
+        """Saves a checkpoint as nerfstudio does, but only a whole and finite one, and drops the former one after that.
 
-        While steps are being skipped, the state is under suspicion: nothing is saved then, and at the end of training
-        the former checkpoint is kept beside the last.
+        While steps are being skipped nothing is saved; at the end of training the former checkpoint is kept then.
         """
         suspect = self._look_at_skipped(step) > 0
         if suspect and not self._interrupted and step + 1 < self.config.max_num_iterations:
@@ -309,7 +296,7 @@ class SparseStyleTrainer(Trainer, ABC):
         target, unfinished = checkpoint_path(self.checkpoint_dir, step), self.base_dir / "checkpoint.unfinished"
         content = step, self.pipeline.state_dict(), self.optimizers, self.notes(), self.grad_scaler
         try:
-            write_checkpoint(target, *content, unfinished)
+            checkpoints.write_checkpoint(target, *content, unfinished)
         except (OSError, RuntimeError) as error:  # torch's writer makes a RuntimeError of some OSErrors
             unfinished.unlink(missing_ok=True)
             raise InputError(

@@ -12,6 +12,7 @@ from typing import Dict, List, Literal, Optional, Sequence
 
 import torch
 
+from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.prepare.diagnosis import check_photos
 from sparsestyle_ns.prepare.framing import (
     MIN_PHOTOS,
@@ -23,6 +24,7 @@ from sparsestyle_ns.prepare.framing import (
     write_photos,
 )
 from sparsestyle_ns.prepare.poses import TRANSFORMS, Poses, find_poses, fits
+from sparsestyle_ns.prepare.prepare_options import PrepareOptions
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.ffmpeg import put_ffmpeg_on_path
 
@@ -36,6 +38,13 @@ class PreparedScene:
     folder: Path
     parser: str
     names: List[str]
+
+
+def prepare(options: PrepareOptions) -> None:
+    """Makes a scene of photos, and says where it is; see `prepare_scene`."""
+    scene = prepare_scene(options.photos, options.output, options.poses)
+    made = f"{scene.folder}, {len(scene.names)} photos with poses"
+    finish(made, ["ns-train", "coarse-fewshot", "--data", scene.folder, scene.parser])
 
 
 def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> PreparedScene:
