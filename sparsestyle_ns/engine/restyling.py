@@ -24,8 +24,7 @@ from sparsestyle_ns.engine.training import check_skipped, training_step, warm_st
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleInputs, StyleTask
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path, write_checkpoint
 from sparsestyle_ns.runs.run_folder import read_config
-from sparsestyle_ns.runs.scene_record import FILE_NAME as SCENE_RECORD
-from sparsestyle_ns.runs.thumbnail import save_thumbnail
+from sparsestyle_ns.runs.scene_record import RECORD_FILE, save_thumbnail
 from sparsestyle_ns.style.backbone import Backbone
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.distributed import num_processes
@@ -36,7 +35,7 @@ from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 
 SEED = 42
 """Of a new field's weights; nerfstudio's own."""
-BESIDE_CHECKPOINTS = (SCENE_RECORD, "dataparser_transforms.json")
+BESIDE_CHECKPOINTS = (RECORD_FILE, "dataparser_transforms.json")
 """Files of a run that say nothing of the style."""
 PAINTING_FOLDER = "style_image"
 """Of a run's folder, where its painting lies under the name that it came with: no name can be that of another file."""

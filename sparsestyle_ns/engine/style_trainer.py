@@ -23,8 +23,7 @@ from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipe
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes
 from sparsestyle_ns.runs.coarse_run import CoarseRun, check_scene, find_coarse_run, read_coarse_run
 from sparsestyle_ns.runs.run_folder import COARSE_METHOD
-from sparsestyle_ns.runs.scene_record import record_scene
-from sparsestyle_ns.runs.thumbnail import save_thumbnail
+from sparsestyle_ns.runs.scene_record import record_scene, save_thumbnail
 from sparsestyle_ns.utils.distributed import from_first_process
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.progress import bar

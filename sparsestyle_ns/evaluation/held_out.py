@@ -44,21 +44,13 @@ class HeldOutReport:
     """Over the held-out views, and for a stylised run those over pairs of the measuring path."""
     views: List[Dict[str, float]]
     """The held-out views' own values."""
-    rays: List[int] = field(default_factory=list)
-    """Each view's pixels; not in a file."""
-    seconds: List[float] = field(default_factory=list)
-    """How long each view took to render; not in a file."""
+    speed: Dict[str, float] = field(default_factory=dict)
+    """Of rendering: `num_rays_per_sec` and `fps`, means over the views; not in a file."""
 
     def deviations(self) -> Dict[str, float]:
         """As `…_std`, the standard deviations between views; nothing of what fewer than two views have."""
         found = by_figure(self.views)
         return {f"{key}_std": statistics.stdev(values) for key, values in found.items() if len(values) > 1}
-
-    def speed(self) -> Dict[str, float]:
-        """`num_rays_per_sec` and `fps`, means over the views."""
-        rates = [rays / seconds for rays, seconds in zip(self.rays, self.seconds, strict=True)]
-        fps = statistics.fmean(1.0 / seconds for seconds in self.seconds)
-        return {"num_rays_per_sec": statistics.fmean(rates), "fps": fps}
 
     def save(self, path: Path, experiment: str, method: str, step: int) -> None:
         """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means."""
@@ -81,6 +73,11 @@ def by_figure(views: Sequence[Dict[str, float]]) -> Dict[str, List[float]]:
     return {name: [view[name] for view in views if name in view] for name in names}
 
 
+def means_of(views: Sequence[Dict[str, float]]) -> Dict[str, float]:
+    """Each figure's mean over the views that have it."""
+    return {name: statistics.fmean(values) for name, values in by_figure(views).items()}
+
+
 @torch.no_grad()
 def evaluate_held_out(
     model: Union[CoarseFewShotModel, HierStyleModel],
@@ -90,31 +87,27 @@ def evaluate_held_out(
     baked: bool = False,
     picture_folder: Optional[Path] = None,
 ) -> HeldOutReport:
-    """Evaluates a model on views that it hasn't seen, and on the measuring path.
+    """Evaluates a model in evaluation on views that it hasn't seen, and on the measuring path, all by exact renders.
 
     Coarse model: `psnr` in dB, `ssim`, `lpips` and `st_lpips` where there are weights, and `effective_samples`.
     Stylised model: the same of the coarse field with the prefix `coarse_`; `content_ssim`; with `targets` what
     `stylisation_figures` gives and, where there are weights for it, `art_fid` of all views, with photos as content; and
-    the consistency of frames on the measuring path (`PathFrames.figures`), where there are the two training cameras
-    that it takes. All of these are of exact renders.
+    the consistency of frames on the measuring path (`PathFrames.figures`), where there are two training cameras.
 
     Args:
-        model: in evaluation.
-        views: photos and their cameras.
-        training_cameras: those that the measuring path leads through.
         targets: the painting's features, for a stylised model.
         baked: whether a stylised model's baked renders are held against the exact ones as well (`baked_psnr`, in dB).
-        picture_folder: where to save the views as pictures, beside their photos; None for nowhere.
+        picture_folder: where to save the views as pictures, beside their photos.
     """
     style = None if isinstance(model, CoarseFewShotModel) else _StyleMeasure(model, targets, baked)
-    values, rays, seconds = [], [], []
+    values, speeds = [], []
     for index in track(range(len(views)), "Held-out views"):
         camera = views.cameras[index : index + 1].to(model.device)
         photo = views[index]["image"][..., :3]
         start = time.perf_counter()
         outputs = exact_outputs(model, camera)
-        seconds.append(time.perf_counter() - start)
-        rays.append(photo.shape[0] * photo.shape[1])
+        fps = 1.0 / (time.perf_counter() - start)
+        speeds.append({"num_rays_per_sec": fps * photo.shape[0] * photo.shape[1], "fps": fps})
         if style is not None:
             values.append(style.view(outputs, photo, camera))
         else:
@@ -126,13 +119,13 @@ def evaluate_held_out(
             _, pictures = model.get_image_metrics_and_images(outputs, {"image": photo})
             for name, picture in pictures.items():
                 save_image(picture.permute(2, 0, 1).cpu(), picture_folder / f"eval_{name}_{index:04d}.png")
-    means = {key: statistics.fmean(found) for key, found in by_figure(values).items()}
+    means = means_of(values)
     if style is not None:
         if style.art_fid is not None:
             means.update(style.art_fid.figures())
         if len(training_cameras) > 1:
             means.update(render_path(model, measuring_path(training_cameras)).figures())
-    return HeldOutReport(means, values, rays, seconds)
+    return HeldOutReport(means, values, means_of(speeds))
 
 
 class _StyleMeasure:
@@ -159,7 +152,7 @@ class _StyleMeasure:
 
 
 def exact_outputs(model: Union[CoarseFewShotModel, HierStyleModel], camera: Cameras) -> Dict[str, Tensor]:
-    """A camera's outputs, of a stylised run in exact rendering whatever its own mode is; a coarse run has no other."""
+    """A camera's outputs in exact rendering, whatever a stylised model's own mode is; a coarse one has no other."""
     if isinstance(model, CoarseFewShotModel):
         return model.get_outputs_for_camera(camera)
     with model.rendering("exact"):
@@ -173,11 +166,10 @@ def stylisation_figures(
     stylised: Float[Tensor, "H W 3"],
     accumulation: Optional[Float[Tensor, "H W"]],
 ) -> Dict[str, float]:
-    """How strong the style of a view is, before and after stylising, and how far its content has moved.
+    """How strong the style of a view is, before (`…_before`) and after stylising, and how far its content has moved.
 
-    `style_loss` is the nearest neighbour feature matching of Eq. 5, `content_loss` the distance of features (Eq. 5)
-    from the unstylised view, and any other loss of `targets` likewise `NAME_loss`; `gram_distance` is that of
-    `metrics.gram`. All but the content loss come with their value for the unstylised view, as `…_before`. With
+    `style_loss` is the nearest neighbour feature matching of Eq. 5, `content_loss` its distance of features from the
+    unstylised view, any other loss of `targets` `NAME_loss`, and `gram_distance` that of `metrics.gram`. With
     `accumulation`, only where the scene covers the picture: a background can't be stylised.
     """
     content = targets.features(coarse)

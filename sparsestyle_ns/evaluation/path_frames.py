@@ -23,10 +23,7 @@ class PathFrames:
     surfaces: List[Surface]
 
     def figures(self) -> Dict[str, float]:
-        """Consistency of the stylised frames, and as `ceiling_…` that of the unstylised ones under the same masks.
-
-        `short_visible` and `long_visible` are the shares of pixels that count.
-        """
+        """Consistency of the stylised frames, `ceiling_…` of the unstylised ones, and `…_visible` shares of pixels."""
         geometry = PathGeometry(self.surfaces)
         values = geometry.consistency(self.stylised)
         values.update({f"ceiling_{key}": value for key, value in geometry.consistency(self.coarse).items()})
@@ -36,18 +33,14 @@ class PathFrames:
 
 @torch.no_grad()
 def render_path(model: HierStyleModel, cameras: Cameras) -> PathFrames:
-    """Renders a path's frames, each exactly, and finds the world points that the unstylised scene shows there.
-
-    `depth_coarse` is a distance in world units along a unit direction in every space, NDC too, so that the points are
-    in the world, where cameras project.
-    """
+    """Renders a path's frames, each exactly, and finds the world points that the unstylised scene shows there."""
     frames = PathFrames([], [], [])
     for index in track(range(len(cameras)), "Measuring path"):
         camera = cameras[index : index + 1].to(model.device)
         with model.rendering("exact"):
             outputs = model.get_outputs_for_camera(camera)
         rays = camera.generate_rays(camera_indices=0, keep_shape=True)
-        points = rays.origins + outputs["depth_coarse"] * rays.directions
+        points = rays.origins + outputs["depth_coarse"] * rays.directions  # in the world in every space, NDC too
         focal, center = (float(camera.fx), float(camera.fy)), (float(camera.cx), float(camera.cy))
         pinhole = Pinhole(camera.camera_to_worlds[0].cpu(), focal, center)
         covered = (outputs["accumulation_coarse"] > MIN_COVERAGE).squeeze(-1)

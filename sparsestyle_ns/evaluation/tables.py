@@ -32,21 +32,17 @@ PERCEPTUAL = ("rmse", "ssim", "lpips", "st_lpips")
 
 @dataclass
 class Table:
-    """A table of figures.
-
-    Attributes:
-        title: above it.
-        columns: headings of the columns after the first.
-        rows: each row's name and cells; None is an empty one.
-        note: a sentence below it.
-        cited: names of rows whose figures are others', not measured here.
-    """
+    """A table of figures."""
 
     title: str
     columns: Sequence[str]
+    """Headings of the columns after the first."""
     rows: List[Tuple[str, List[Optional[str]]]] = field(default_factory=list)
+    """Each row's name and cells; None is an empty one."""
     note: str = ""
+    """A sentence below it."""
     cited: Tuple[str, ...] = ()
+    """Names of rows whose figures are others', not measured here."""
 
     def print(self) -> None:
         """Prints it."""
@@ -59,13 +55,6 @@ class Table:
         Console().print(printed)
 
 
-def written(key: str, value: Optional[float]) -> Optional[str]:
-    """A figure as text, with the decimals of its kind; `key` may be preceded by what it is of (`short_rmse`)."""
-    if value is None:
-        return None
-    return f"{value:.{LABELS[key][1]}f}"
-
-
 def table_of(
     title: str,
     columns: Sequence[Tuple[str, str, str]],
@@ -75,18 +64,15 @@ def table_of(
     """A table of some of each row's figures; columns that no row has a figure for are left out.
 
     Args:
-        title: above it.
         columns: of each the figure's key in a row, its kind (a key of `LABELS`), and words before the kind's label.
         rows: of each its name and figures.
-        note: below it.
     """
     shown = [column for column in columns if any(figures.get(column[0]) is not None for _, figures in rows)]
-    return Table(
-        title,
-        [f"{words}{LABELS[kind][0]}" for _, kind, words in shown],
-        [(name, [written(kind, figures.get(key)) for key, kind, _ in shown]) for name, figures in rows],
-        note,
-    )
+    table = Table(title, [f"{words}{LABELS[kind][0]}" for _, kind, words in shown], note=note)
+    for name, figures in rows:
+        values = [(figures.get(key), LABELS[kind][1]) for key, kind, _ in shown]
+        table.rows.append((name, [None if value is None else f"{value:.{digits}f}" for value, digits in values]))
+    return table
 
 
 def consistency_columns() -> List[Tuple[str, str, str]]:
@@ -98,9 +84,8 @@ def report_tables(means: Dict[str, float], num_views: int) -> List[Table]:
     """The tables of one run's figures, as `sparsestyle evaluate` prints them."""
     views = f"{num_views} held-out view" + "s" * (num_views > 1)
     prefix = "coarse_" if "coarse_psnr" in means else ""
-    tables = [
-        table_of(f"Coarse field, {views}", [(f"{prefix}{k}", k, "") for k in COARSE_QUALITY], [("coarse", means)])
-    ]
+    quality = [(f"{prefix}{key}", key, "") for key in COARSE_QUALITY]
+    tables = [table_of(f"Coarse field, {views}", quality, [("coarse", means)])]
     if not prefix:
         return tables
     kept = [(key, key, "") for key in (*STYLE_AND_CONTENT, "content_ssim", "baked_psnr")]

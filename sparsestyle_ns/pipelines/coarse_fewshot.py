@@ -46,7 +46,7 @@ class CoarseFewShotPipeline(CheckedPipeline):
         """Adds the decision about empty space to nerfstudio's callbacks, and prepares the semantic loss.
 
         Raises:
-            InputError: there can be no semantic loss with these settings, these photos or these weights.
+            InputError: there can be no semantic loss with these settings, photos or weights.
         """
         weight, every = self.config.semantic_weight, self.config.semantic_every
         if not 0.0 <= weight < float("inf"):
@@ -70,8 +70,7 @@ class CoarseFewShotPipeline(CheckedPipeline):
         if side < backbone.smallest_side:
             raise InputError(f"--pipeline.semantic-side is {side}; give {backbone.smallest_side} or more pixels.")
         self.announce(backbone)
-        colors = pixels.colors.tensor_split(pixels.starts[1:-1])
-        photos = [rows.view(*size, 3) for rows, size in zip(colors, pixels.sizes, strict=True)]
+        photos = [pixels.colors[pixels.rows(view)].view(*size, 3) for view, size in enumerate(pixels.sizes)]
         return UnseenViews(backbone, cameras, photos, side)
 
     def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Any], Dict[str, Tensor], Dict[str, Any]]:
@@ -84,10 +83,8 @@ class CoarseFewShotPipeline(CheckedPipeline):
         return outputs, losses, metrics
 
     def decide_empty_space(self, step: int) -> None:
-        """After every tenth of the iterations from three quarters on, measures whether skipping empty space pays.
-
-        Before, the field is still half the fog that it starts as, and a measurement would say so.
-        """
+        """After every tenth of the iterations from three quarters on, measures whether skipping empty space pays."""
+        # Before, the field is still half the fog that it starts as, and a measurement would say so.
         done, total = step + 1, self.model.num_steps
         if done % max(1, total // 10) or not 3 * total <= 4 * done < 4 * total:
             return
@@ -98,7 +95,5 @@ class CoarseFewShotPipeline(CheckedPipeline):
         if self.effects.on("empty_space") != before:
             self.model.build_grid(self.effects)
             decision = self.effects["empty_space"]
-            CONSOLE.print(
-                f"Empty-space skipping is {'on' if decision.on else 'off'} from iteration {done} on: "
-                f"{decision.measured:.0%} {decision.reason}."
-            )
+            word, why = "on" if decision.on else "off", f"{decision.measured:.0%} {decision.reason}"
+            CONSOLE.print(f"Empty-space skipping is {word} from iteration {done} on: {why}.")

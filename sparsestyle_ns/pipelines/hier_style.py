@@ -103,7 +103,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
 
 
 class StyleTask(NamedTuple):
-    """A field that is on its way to a painting, and the views that it is stylised on; in turn, one an iteration."""
+    """A field that is on its way to a painting, and the views that it is stylised on, one an iteration."""
 
     style: nn.Module
     targets: StyleTargets
@@ -124,17 +124,16 @@ class HierStylePipeline(CheckedPipeline):
     """Told of each iteration and its losses, by a viewer that shows them."""
 
     def new_task(self, style: nn.Module, targets: StyleTargets, effects: Decisions) -> StyleTask:
-        """A field and a painting for the scene's views; what of these depends on no painting is shared."""
+        """A field and a painting for the scene's views, which are shared as far as they depend on no painting."""
         if self.scene_views is None:
             self.scene_views = self.freeze_views()
         return StyleTask(style, targets, self.scene_views.for_painting(targets, effects))
 
     def freeze_views(self) -> SceneViews:
         """The scene's views, with all that depends on no style."""
-        config, photos = self.config, self.datamanager.pixels
-        cameras = self.datamanager.train_dataset.cameras
-        sizes = config.novel_views, config.samples_per_chunk, config.cache_gigabytes
-        return SceneViews(self.model, photos, cameras, *sizes)
+        config, manager = self.config, self.datamanager
+        limits = config.samples_per_chunk, config.cache_gigabytes
+        return SceneViews(self.model, manager.pixels, manager.train_dataset.cameras, config.novel_views, *limits)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -148,7 +147,7 @@ class HierStylePipeline(CheckedPipeline):
         return super().get_training_callbacks(training_callback_attributes)
 
     def style_targets(self, style_image: Optional[Path] = None) -> Optional[StyleTargets]:
-        """The painting to measure against, where it is still there; another one than the run's where that is given."""
+        """The painting to measure against, the run's own or another, where it is still there."""
         if self.targets is not None and style_image is None:
             return self.targets
         path = style_image or self.config.style_image
@@ -160,10 +159,10 @@ class HierStylePipeline(CheckedPipeline):
     def warm_start_loss(self, task: StyleTask, step: int) -> Dict[str, Float[Tensor, ""]]:
         """How far c_f, on the coarse geometry, is from the content picture of one photo; not in the paper.
 
-        The features of VGG's third block hardly see colour; stylising from grey loses the palette. A coarse field that
-        is fine-tuned itself is fitted as a whole: its colours can't change with its geometry held.
+        The features of VGG's third block hardly see colour; stylising from grey loses the palette.
         """
         view = task.views[step % self.scene_views.num_photos]
+        # A coarse field that is fine-tuned itself is fitted as a whole: it can't change colours with its geometry held.
         coarse_geometry = self.model.config.stylised_field == "residual"
         picture = self.scene_views.render(view, task.style, coarse_geometry)
         return {"reconstruction_loss": reconstruction_loss(picture, view.picture)}

@@ -42,8 +42,7 @@ class SceneViews:
 
     Args:
         model: whose coarse field is final.
-        pixels: of the photos.
-        cameras: of the photos.
+        pixels, cameras: of the photos.
         novel_views: how many views between the photos there are.
         samples_per_chunk: samples that are rendered at once, at most.
         cache_gigabytes: memory for what never changes; None: a quarter of what is free.
@@ -78,8 +77,7 @@ class SceneViews:
         return frozen
 
     def _photo_view(self, pixels: TrainingPixels, index: int) -> ContentView:
-        height, width = pixels.sizes[index]
-        rows = slice(pixels.starts[index], pixels.starts[index + 1])
+        (height, width), rows = pixels.sizes[index], pixels.rows(index)
         frozen = self._freeze(pixels.origins[rows], pixels.directions[rows])
         accumulation = gather_rays(frozen.render(accumulation_of), height * width)
         colors, exposure = pixels.colors[rows], self.model.exposure
@@ -107,7 +105,7 @@ class SceneViews:
         return views if self.model.background is not None else [replace(view, accumulation=None) for view in views]
 
     def _in_style_colors(self, targets: StyleTargets) -> Iterator[Tuple[ContentView, Tensor]]:
-        """Views, and their pictures in the painting's colours; where the scene is transparent, the background stays."""
+        """Views, and their pictures in the painting's colours; a background that is seen through the scene stays."""
         photos = self.views[: self.num_photos]
         colors = torch.cat([view.picture.reshape(-1, 3) for view in photos])
         weight = torch.cat([view.accumulation.reshape(-1) for view in photos])
@@ -120,7 +118,7 @@ class SceneViews:
             yield view, picture
 
     def render(self, view: ContentView, style: nn.Module, coarse_geometry: bool = False) -> Float[Tensor, "H W 3"]:
-        """The stylised picture of a view, of which each process renders its share of the rays; differentiable."""
+        """The stylised picture of a view, to whose rays each process contributes its share; differentiable."""
         own = view.frozen.render(lambda chunk: self.model.stylised(chunk, coarse_geometry, style).rgb)
         return gather_rays(own, view.picture[..., 0].numel()).view(view.picture.shape)
 

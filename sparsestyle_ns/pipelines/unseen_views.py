@@ -1,7 +1,6 @@
 """Views that nobody photographed, and what photos of the same scene say of them (DietNeRF, Jain et al. 2021).
 
-DietNeRF embeds pictures by CLIP, which knows what things are. Here it is VGG-16's third block, averaged over the
-picture: it knows textures and parts of things, and the loss is DietNeRF's in form only.
+DietNeRF embeds pictures by CLIP, which knows things; here VGG-16's third block knows their textures and parts.
 """
 
 from typing import List
@@ -28,15 +27,13 @@ class UnseenViews:
     Kept out of the pipeline's modules: a checkpoint doesn't hold the network.
 
     Args:
-        backbone: the feature network.
         cameras: of the photos, two or more.
         photos: what they saw, in [0, 1], on the network's device.
         side: longer side, in pixels, at which views are rendered, and the network sees them and the photos.
     """
 
     def __init__(self, backbone: Backbone, cameras: Cameras, photos: List[Float[Tensor, "H W 3"]], side: int) -> None:
-        self.backbone = backbone
-        self.side = side
+        self.backbone, self.side = backbone, side
         places = unseen_places(cameras, NUM_PLACES)
         longest = max(int(places.width[0]), int(places.height[0]))
         places.rescale_output_resolution(side / longest, scale_rounding_mode="ceil")

@@ -1,8 +1,4 @@
-"""Checkpoints: written whole and finite, found, and read.
-
-nerfstudio's layout: a run's folder nerfstudio_models has step-000000123.ckpt, with the iteration and the state of
-pipeline, optimisers and schedulers; here also notes on what made it.
-"""
+"""Checkpoints in nerfstudio's layout, with notes on what made them: written whole and finite, found, and read."""
 
 import re
 from pathlib import Path
@@ -80,11 +76,8 @@ def write_checkpoint(
     """Writes a checkpoint that nerfstudio can load, whole or not at all.
 
     Args:
-        path: of the checkpoint.
         step: the last iteration that was done.
         pipeline: its state.
-        optimizers: with their schedulers.
-        notes: what made it.
         scaler: of gradients; None: one that is off.
         unfinished: see `write_whole`; not in the folder of checkpoints, where nerfstudio takes every file for one.
 

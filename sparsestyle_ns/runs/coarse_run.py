@@ -11,7 +11,7 @@ from torch import Tensor
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, load_checkpoint, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import COARSE_METHOD, read_config
-from sparsestyle_ns.runs.scene_record import FILE_NAME, SceneRecord
+from sparsestyle_ns.runs.scene_record import RECORD_FILE, SceneRecord
 from sparsestyle_ns.utils.errors import InputError
 
 
@@ -23,21 +23,16 @@ class CoarseRun(NamedTuple):
     checkpoint: Path
 
     @property
-    def iterations(self) -> int:
-        """How many are done."""
-        return checkpoint_step(self.checkpoint) + 1
-
-    @property
     def is_finished(self) -> bool:
         """Whether all iterations are done."""
-        return self.iterations >= self.config.max_num_iterations
+        return checkpoint_step(self.checkpoint) + 1 >= self.config.max_num_iterations
 
     def in_words(self) -> str:
         """Where it is, and how far where it isn't finished."""
         if self.is_finished:
             return str(self.folder)
-        total = self.config.max_num_iterations
-        return f"{self.folder}, which isn't finished ({self.iterations} of {total} iterations)"
+        done, total = checkpoint_step(self.checkpoint) + 1, self.config.max_num_iterations
+        return f"{self.folder}, which isn't finished ({done} of {total} iterations)"
 
     def model_state(self) -> Dict[str, Tensor]:
         """The state of the run's model."""
@@ -95,7 +90,7 @@ def check_scene(run: CoarseRun, scene: SceneRecord) -> None:
 def find_coarse_run(output_dir: Path, methods: Iterable[str], scene: SceneRecord) -> Optional[CoarseRun]:
     """The newest finished run of a scene among the runs of some methods below an output folder; None without one."""
     found: List[CoarseRun] = []
-    for record in (path for method in methods for path in output_dir.glob(f"*/{method}/*/{FILE_NAME}")):
+    for record in (path for method in methods for path in output_dir.glob(f"*/{method}/*/{RECORD_FILE}")):
         try:
             run = read_coarse_run(record.parent)
             check_scene(run, scene)

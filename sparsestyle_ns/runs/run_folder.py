@@ -11,11 +11,8 @@ from sparsestyle_ns.utils.errors import InputError
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
-COARSE_METHOD = "coarse-fewshot"
-"""What the names of stage 1's methods start with."""
-STYLE_METHOD = "hier-style"
-"""What the names of stage 2's methods start with."""
-
+COARSE_METHOD, STYLE_METHOD = "coarse-fewshot", "hier-style"
+"""What the names of stage 1's methods start with, and those of stage 2's."""
 REPORT_FILE = "evaluation.json"
 """What was measured of a run, in its folder."""
 
@@ -24,8 +21,7 @@ def find_config(run: Path, method: str = "") -> Path:
     """The config.yml of a run, given by its folder or by that file; reads no more than its method's name.
 
     Args:
-        run: the folder or the file.
-        method: what the name of the run's method starts with; empty for either method of this package.
+        method: what that starts with; empty for either method of this package.
 
     Raises:
         InputError: it isn't there, or is a run of another method.
