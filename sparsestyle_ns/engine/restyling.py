@@ -5,6 +5,7 @@ is held while the new field learns.
 """
 
 import copy
+import functools
 import shutil
 import tempfile
 import time
@@ -66,19 +67,16 @@ class Workshop:
         if num_processes() > 1:
             raise InputError("Several processes train this scene together; restyle it in ns-viewer, once it is saved.")
         self.pipeline, self.folder, self.lock = pipeline, folder, lock
-        self._backbone: Optional[Backbone] = None
 
     def config(self) -> SparseStyleTrainerConfig:
         """The run's config, as it is by now."""
         return read_config(self.folder)
 
+    @functools.cached_property
     def backbone(self) -> Backbone:
         """The feature network that the pipeline has, else one with the weights that it would take."""
-        if self.pipeline.targets is not None:
-            return self.pipeline.targets.backbone
-        if self._backbone is None:
-            self._backbone = self.pipeline.config.load_backbone(self.pipeline.device)
-        return self._backbone
+        pipeline = self.pipeline
+        return pipeline.targets.backbone if pipeline.targets else pipeline.config.load_backbone(pipeline.device)
 
     def new_field(self) -> nn.Module:
         """A field as it is before training, the same each time."""
@@ -110,7 +108,7 @@ class Restyling:
     def __iter__(self) -> Iterator[Progress]:
         yield Progress(f"Looking at {self.image.name}")
         pipeline, total = self.pipeline, self.iterations
-        targets = pipeline.config.targets_of(StyleInputs(self.image, self.workshop.backbone()), pipeline.device)
+        targets = pipeline.config.targets_of(StyleInputs(self.image, self.workshop.backbone), pipeline.device)
         scene = replace(pipeline.datamanager.scene, style_image=self.image.pixels)
         self.effects = decide_again(pipeline.effects, "palette", scene)  # what depends on the painting
         if pipeline.scene_views is None:
@@ -185,4 +183,4 @@ class Restyling:
 
     def notes(self) -> CheckpointNotes:
         """What its checkpoint says beside the state."""
-        return style_notes(self.pipeline, self.effects, asdict(self.workshop.backbone().description))
+        return style_notes(self.pipeline, self.effects, asdict(self.workshop.backbone.description))

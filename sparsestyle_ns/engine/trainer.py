@@ -169,10 +169,8 @@ class SparseStyleTrainer(Trainer, ABC):
         """
         total = self.config.max_num_iterations
         if self._start_step >= total:
-            raise InputError(
-                f"The checkpoint is of iteration {self._start_step}, and --max-num-iterations is {total}; raise it to "
-                "train on."
-            )
+            done = f"The checkpoint is of iteration {self._start_step}"
+            raise InputError(f"{done}, and --max-num-iterations is {total}; raise it to train on.")
         self._interrupted = False
         former = signal.signal(signal.SIGINT, self._on_interrupt)
         has_table = self.config.logging.local_writer.enable  # nerfstudio's, which would write over the bar
@@ -293,12 +291,10 @@ class SparseStyleTrainer(Trainer, ABC):
         if suspect and not self._interrupted and step + 1 < self.config.max_num_iterations:
             CONSOLE.print(f"No checkpoint of iteration {step + 1}: its step was skipped.")
             return
-        target, unfinished = checkpoint_path(self.checkpoint_dir, step), self.base_dir / "checkpoint.unfinished"
-        content = step, self.pipeline.state_dict(), self.optimizers, self.notes(), self.grad_scaler
+        target, state = checkpoint_path(self.checkpoint_dir, step), self.pipeline.state_dict()
         try:
-            checkpoints.write_checkpoint(target, *content, unfinished)
+            checkpoints.write_checkpoint(target, step, state, self.optimizers, self.notes(), self.grad_scaler)
         except (OSError, RuntimeError) as error:  # torch's writer makes a RuntimeError of some OSErrors
-            unfinished.unlink(missing_ok=True)
             raise InputError(
                 f"The checkpoint of iteration {step + 1} can't be saved in {self.checkpoint_dir} ({error}); the former "
                 "one is still there. Make room, and go on from it with --load-dir."

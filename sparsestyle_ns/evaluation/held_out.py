@@ -1,4 +1,4 @@
-"""What a run is worth on the views it hasn't seen: how true the coarse field is, how stylised the stylised one."""
+"""What a run is worth on views that it hasn't seen: how true the coarse field is, how stylised the stylised one."""
 
 import json
 import statistics
@@ -19,11 +19,12 @@ from sparsestyle_ns.core.occupancy import interval_lengths
 from sparsestyle_ns.core.precision import autocast
 from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.volrend import dense_weights, effective_samples, optical_depth
-from sparsestyle_ns.evaluation.path_frames import render_path
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID
+from sparsestyle_ns.metrics.consistency import RANGES, PathGeometry
 from sparsestyle_ns.metrics.gram import gram_distance, gram_matrix
 from sparsestyle_ns.metrics.image import image_metrics, psnr
+from sparsestyle_ns.metrics.warping import MIN_COVERAGE, Pinhole, Surface
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.runs.run_folder import REPORT_FILE
@@ -201,3 +202,39 @@ def mean_effective_samples(model: CoarseFewShotModel, camera: Cameras) -> Option
         counts.append(effective_samples(weights)[weights.sum(dim=-1) > MIN_ACCUMULATION])
     found = torch.cat(counts)
     return float(found.mean()) if len(found) else None
+
+
+@dataclass
+class PathFrames:
+    """Frames of the measuring path, and what they show of the unstylised scene; on the CPU."""
+
+    stylised: List[Float[Tensor, "H W 3"]]
+    coarse: List[Float[Tensor, "H W 3"]]
+    surfaces: List[Surface]
+
+    def figures(self) -> Dict[str, float]:
+        """Consistency of the stylised frames, `ceiling_…` of the unstylised ones, and `…_visible` shares of pixels."""
+        geometry = PathGeometry(self.surfaces)
+        values = geometry.consistency(self.stylised)
+        values.update({f"ceiling_{key}": value for key, value in geometry.consistency(self.coarse).items()})
+        shares = {f"{name}_visible": geometry.visible_share(name) for name in RANGES}
+        return {**values, **{key: share for key, share in shares.items() if share is not None}}
+
+
+@torch.no_grad()
+def render_path(model: HierStyleModel, cameras: Cameras) -> PathFrames:
+    """Renders a path's frames, each exactly, and finds the world points that the unstylised scene shows there."""
+    frames = PathFrames([], [], [])
+    for index in track(range(len(cameras)), "Measuring path"):
+        camera = cameras[index : index + 1].to(model.device)
+        with model.rendering("exact"):
+            outputs = model.get_outputs_for_camera(camera)
+        rays = camera.generate_rays(camera_indices=0, keep_shape=True)
+        points = rays.origins + outputs["depth_coarse"] * rays.directions  # in the world in every space, NDC too
+        focal, center = (float(camera.fx), float(camera.fy)), (float(camera.cx), float(camera.cy))
+        pinhole = Pinhole(camera.camera_to_worlds[0].cpu(), focal, center)
+        covered = (outputs["accumulation_coarse"] > MIN_COVERAGE).squeeze(-1)
+        frames.stylised.append(outputs["rgb"].clamp(0.0, 1.0).cpu())
+        frames.coarse.append(outputs["rgb_coarse"].clamp(0.0, 1.0).cpu())
+        frames.surfaces.append(Surface(pinhole, points.cpu(), covered.cpu()))
+    return frames

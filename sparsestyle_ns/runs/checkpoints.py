@@ -71,7 +71,6 @@ def write_checkpoint(
     optimizers: Optimizers,
     notes: CheckpointNotes,
     scaler: Optional[GradScaler] = None,
-    unfinished: Optional[Path] = None,
 ) -> None:
     """Writes a checkpoint that nerfstudio can load, whole or not at all.
 
@@ -79,7 +78,6 @@ def write_checkpoint(
         step: the last iteration that was done.
         pipeline: its state.
         scaler: of gradients; None: one that is off.
-        unfinished: see `write_whole`; not in the folder of checkpoints, where nerfstudio takes every file for one.
 
     Raises:
         InputError: a number in the state isn't finite.
@@ -101,4 +99,5 @@ def write_checkpoint(
     }
     # nerfstudio's exponential schedulers leave numpy's numbers, which torch refuses to load (`weights_only`).
     plain = tree_map_only(np.generic, lambda number: number.item(), state)
+    unfinished = path.parents[1] / "checkpoint.unfinished"  # nerfstudio takes every file beside `path` for a checkpoint
     write_whole(path, lambda file: torch.save(plain, file), unfinished)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestyle_ns.engine.previews import preview_path
-from sparsestyle_ns.evaluation.path_frames import PathFrames
+from sparsestyle_ns.evaluation.held_out import PathFrames
 from sparsestyle_ns.evaluation.tables import COARSE_QUALITY, STYLE_AND_CONTENT, Table, consistency_columns, table_of
 from sparsestyle_ns.metrics.art_fid import why_left_out
 from sparsestyle_ns.runs.scene_record import SceneRecord

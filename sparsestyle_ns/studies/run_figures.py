@@ -14,8 +14,7 @@ from torchvision.utils import save_image
 
 from sparsestyle_ns.core.camera_paths import measuring_path
 from sparsestyle_ns.engine.loading import evaluate_run, load_run
-from sparsestyle_ns.evaluation.held_out import saved_report, stylisation_figures
-from sparsestyle_ns.evaluation.path_frames import PathFrames, render_path
+from sparsestyle_ns.evaluation.held_out import PathFrames, render_path, saved_report, stylisation_figures
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID, missing_weights
 from sparsestyle_ns.metrics.gram import gram_matrix
