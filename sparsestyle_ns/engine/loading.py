@@ -25,11 +25,7 @@ class LoadedRun(NamedTuple):
 
 
 def load_run(config_path: Path) -> LoadedRun:
-    """Loads a run by its config.yml; it may have been moved since it was made.
-
-    Raises:
-        InputError: the run has no checkpoint.
-    """
+    """Loads a run by its config.yml, wherever it is now; InputError where it has no checkpoint."""
     from nerfstudio.utils.eval_utils import eval_setup  # nerfstudio's own circle: it imports all methods
 
     folder = config_path.resolve().parent
@@ -52,11 +48,7 @@ def load_run(config_path: Path) -> LoadedRun:
 
 
 def evaluate(options: EvaluateOptions) -> None:
-    """Measures a run, writes the report, and prints its tables; the options are checked.
-
-    Raises:
-        InputError: the run has no checkpoint, or the painting can't be read.
-    """
+    """Measures a run by checked options, writes the report, and prints its tables; InputError as in `evaluate_run`."""
     if options.style_image is not None:
         Painting.read(options.style_image)
     config = find_config(options.run)
@@ -69,11 +61,7 @@ def evaluate(options: EvaluateOptions) -> None:
 def evaluate_run(
     config_path: Path, output_path: Path, style_image: Optional[Path] = None, baked: bool = False
 ) -> HeldOutReport:
-    """Loads a run by its config.yml, evaluates it (see `CheckedPipeline.held_out_report`), and writes the report.
-
-    Raises:
-        InputError: the run has no checkpoint.
-    """
+    """Loads a run and writes its `CheckedPipeline.held_out_report`; InputError where it has no checkpoint."""
     config, pipeline, step = load_run(config_path)
     report = pipeline.held_out_report(style_image, baked)
     report.save(output_path, config.experiment_name, config.method_name, step)

@@ -16,11 +16,7 @@ from sparsestyle_ns.utils.progress import say
 
 
 def preview_steps(shares: Sequence[float], total: int) -> FrozenSet[int]:
-    """After which iterations, of `total`, a preview is due, by shares of them.
-
-    Raises:
-        InputError: a share isn't in (0, 1].
-    """
+    """After which iterations, of `total`, a preview is due, by shares of them; InputError for one not in (0, 1]."""
     for share in shares:
         if not 0.0 < share <= 1.0:
             raise InputError(f"--previews has {share:g}, which isn't a share of the iterations above 0 and up to 1.")

@@ -1,7 +1,6 @@
 """Another style for a scene whose coarse field is there: the iterations of `ns-train hier-style`, beside a viewer.
 
-What depends on no painting is shared. The model, and what is trained or shown meanwhile, are only read, so that no lock
-is held while the new field learns.
+What depends on no painting is shared and only read, so that no lock is held while the new field learns.
 """
 
 import copy
@@ -36,8 +35,6 @@ from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 
 SEED = 42
 """Of a new field's weights; nerfstudio's own."""
-BESIDE_CHECKPOINTS = (RECORD_FILE, "dataparser_transforms.json")
-"""Files of a run that say nothing of the style."""
 PAINTING_FOLDER = "style_image"
 """Of a run's folder, where its painting lies under the name that it came with: no name can be that of another file."""
 
@@ -57,10 +54,8 @@ class Progress(NamedTuple):
 class Workshop:
     """What all restylings of a scene have in common, whose run is in a folder.
 
-    The lock is held while something changes that other threads may use: the random numbers' state.
-
-    Raises:
-        InputError: several processes train together.
+    The lock is held while something changes that other threads may use: the random numbers' state. InputError where
+    several processes train together.
     """
 
     def __init__(self, pipeline: HierStylePipeline, folder: Path, lock: ContextManager) -> None:
@@ -89,10 +84,7 @@ class Workshop:
 class Restyling:
     """One restyling, in steps: `for progress in restyling: …`, then `field` (σ_f and c_f) is the new style.
 
-    There are as many iterations as the run had, if their number isn't given.
-
-    Raises:
-        InputError: there is no iteration.
+    Without a number of iterations, as many as the run had; InputError for less than 1.
     """
 
     def __init__(self, workshop: Workshop, image: Painting, iterations: Optional[int] = None) -> None:
@@ -142,16 +134,12 @@ class Restyling:
     def save(self) -> Path:
         """Saves the style as a run of its own beside the one in the viewer; returns its folder.
 
-        The run is there as a whole or not at all: it is made in a hidden folder, which goes when something fails.
-
-        Raises:
-            OSError, RuntimeError: it can't be written; torch's writer makes the second of some of the first.
+        It is there as a whole or not at all: what fails leaves nothing. OSError or RuntimeError where it can't be written.
         """
         runs = self.workshop.folder.parent
         hidden = Path(tempfile.mkdtemp(prefix=".restyling-", dir=runs))
         try:
             new = hidden / "run"  # not `hidden` itself, which nobody else may read
-            new.mkdir()
             self._write_contents(new)
             while (folder := runs / datetime.now().strftime("%Y-%m-%d_%H%M%S")).exists():  # as nerfstudio names them
                 time.sleep(0.1)  # until the second is over in which another run began
@@ -164,7 +152,7 @@ class Restyling:
         """Writes a run but for its config."""
         write_whole(new / self._painting, self.image.data)
         save_thumbnail(new, self.image)
-        for name in BESIDE_CHECKPOINTS:
+        for name in (RECORD_FILE, "dataparser_transforms.json"):  # what says nothing of the style
             if (self.workshop.folder / name).is_file():
                 shutil.copy(self.workshop.folder / name, new / name)
         self.effects.save(new)

@@ -116,7 +116,6 @@ class SparseStyleTrainer(Trainer, ABC):
         return FiniteOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
 
     def _save_decisions(self) -> None:
-        """Writes which effects are simulated into effects.json, and into config.yml, from which a run is loaded."""
         self.pipeline.effects.save(self.base_dir)
         self._saved_decisions = self.pipeline.effects
         self.config.save_config()
@@ -131,7 +130,7 @@ class SparseStyleTrainer(Trainer, ABC):
         for source in (self.config.load_dir, self.config.load_checkpoint):
             if source is not None and not source.exists():
                 raise InputError(
-                    f"There is nothing to resume at {source}; name a folder of checkpoints or a .ckpt file."
+                    f"There is nothing to resume at {source}; name a folder of checkpoints, or one of them."
                 )
         folder, step = self.config.load_dir, self.config.load_step
         if folder is None:

@@ -76,10 +76,9 @@ def warm_start(pipeline: HierStylePipeline, task: StyleTask, following: Optimize
 
 
 def check_skipped(optimizers: FiniteOptimizers, most: int, step: int, advice: str) -> int:
-    """How many steps were skipped in a row up to iteration `step`, as their gradients weren't finite; waits for a GPU.
+    """How many steps up to iteration `step` were skipped in a row, as gradients weren't finite; waits for a GPU.
 
-    Raises:
-        InputError: there are `most` or more; the sentence ends with `advice`.
+    InputError, ending with `advice`, where there are `most` or more.
     """
     in_a_row = optimizers.skipped().in_a_row
     if in_a_row >= most:

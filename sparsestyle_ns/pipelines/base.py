@@ -45,11 +45,7 @@ class CheckedPipelineConfig(VanillaPipelineConfig):
     """Makes what the viewer shows of a run beside nerfstudio's own controls; None: nothing."""
 
     def load_backbone(self, device: torch.device) -> Backbone:
-        """The feature network of these settings.
-
-        Raises:
-            InputError: there are no weights for it, or they can't be read.
-        """
+        """The feature network of these settings; InputError where it has no weights that can be read."""
         return load_backbone(self.backbone, self.vgg_weights).to(device)
 
 
@@ -129,10 +125,9 @@ class CheckedPipeline(VanillaPipeline):
 
     @exit_on_input_error
     def load_pipeline(self, loaded_state: Dict[str, Any], step: int) -> None:
-        """Loads a checkpoint's state; nerfstudio would try again without strictness and so lose weights in silence.
+        """Loads a checkpoint's state; InputError where its names or shapes aren't this pipeline's.
 
-        Raises:
-            InputError: the checkpoint's names or shapes are not those of this pipeline.
+        nerfstudio would try again without strictness and so lose weights in silence.
         """
         expected = self.state_dict()
         found = {key.removeprefix("module."): value for key, value in loaded_state.items()}

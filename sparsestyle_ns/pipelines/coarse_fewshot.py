@@ -94,8 +94,7 @@ class CoarseFewShotPipeline(CheckedPipeline):
     ) -> List[TrainingCallback]:
         """Adds the decision about empty space to nerfstudio's callbacks, and prepares the semantic loss.
 
-        Raises:
-            InputError: there can be no semantic loss with these settings, photos or weights.
+        InputError where there can be none with these settings, photos or weights.
         """
         weight, every = self.config.semantic_weight, self.config.semantic_every
         if not 0.0 <= weight < float("inf"):

@@ -80,9 +80,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
     """Chooses the views to train on (`select_views`), reduces large photos, and keeps all their rays in memory.
 
     The pipeline tells it by `set_effects` what was decided about the scene; photos and rays are loaded after that.
-
-    Raises:
-        InputError: the scene or a setting can't be used.
+    InputError where the scene or a setting can't be used.
     """
 
     config: FewShotDataManagerConfig

@@ -67,11 +67,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     """Memory for what never changes of the views; None: a quarter of what is free."""
 
     def load_style(self) -> StyleInputs:
-        """The painting and the feature network, on the CPU.
-
-        Raises:
-            InputError: there is no style image or no weights, or they can't be read, or a setting is out of its range.
-        """
+        """The painting and the feature network, on the CPU; InputError where these or a setting can't be used."""
         if self.style_features is not None and self.style_features < 1:
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
         for name, weight in self.loss_weights.items():

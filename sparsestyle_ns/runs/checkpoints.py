@@ -47,11 +47,7 @@ def newest_checkpoint(folder: Path) -> Optional[Path]:
 
 
 def load_checkpoint(path: Path) -> Dict[str, Any]:
-    """What is in a checkpoint, with its tensors on the CPU.
-
-    Raises:
-        InputError: it can't be read.
-    """
+    """What is in a checkpoint, with its tensors on the CPU; InputError where it can't be read."""
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged archive can fail in many ways
@@ -72,12 +68,7 @@ def write_checkpoint(
     notes: CheckpointNotes,
     scaler: Optional[GradScaler] = None,
 ) -> None:
-    """Writes a checkpoint that nerfstudio can load, whole or not at all.
-
-    Args:
-        step: the last iteration that was done.
-        pipeline: its state.
-        scaler: of gradients; None: one that is off.
+    """Writes a checkpoint of a pipeline's state after iteration `step` that nerfstudio can load, whole or not at all.
 
     Raises:
         InputError: a number in the state isn't finite.

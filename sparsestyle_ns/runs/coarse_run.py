@@ -52,11 +52,7 @@ def under(state: Dict[str, Tensor], prefix: str) -> Dict[str, Tensor]:
 
 
 def read_coarse_run(path: Path) -> CoarseRun:
-    """Reads a run given by its folder or its config.yml.
-
-    Raises:
-        InputError: it isn't there, isn't a coarse-fewshot run, or has no checkpoint.
-    """
+    """Reads a run given by its folder or its config.yml; InputError where it is no coarse-fewshot run with a checkpoint."""
     folder = path.parent if path.name == "config.yml" else path
     if not (folder / "config.yml").is_file():
         raise InputError(
@@ -74,11 +70,7 @@ def read_coarse_run(path: Path) -> CoarseRun:
 
 
 def check_scene(run: CoarseRun, scene: SceneRecord) -> None:
-    """Makes sure that a coarse run is of a scene.
-
-    Raises:
-        InputError: it is of another.
-    """
+    """Raises an InputError where a coarse run is of another scene."""
     difference = scene.difference(SceneRecord.load(run.folder))
     if difference is not None:
         raise InputError(

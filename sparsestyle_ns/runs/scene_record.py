@@ -42,11 +42,7 @@ class SceneRecord:
 
     @classmethod
     def load(cls, folder: Path) -> "SceneRecord":
-        """Reads `scene.json` of a run's folder.
-
-        Raises:
-            InputError: there is none, or it can't be read.
-        """
+        """Reads `scene.json` of a run's folder; InputError where it can't be read."""
         path = folder / RECORD_FILE
         try:
             return cls(**json.loads(path.read_text()))
