@@ -134,7 +134,7 @@ class Restyling:
     def save(self) -> Path:
         """Saves the style as a run of its own beside the one in the viewer; returns its folder.
 
-        It is there as a whole or not at all: what fails leaves nothing. OSError or RuntimeError where it can't be written.
+        It is there as a whole or not at all: what fails leaves nothing. OSError or RuntimeError where it can't be saved.
         """
         runs = self.workshop.folder.parent
         hidden = Path(tempfile.mkdtemp(prefix=".restyling-", dir=runs))

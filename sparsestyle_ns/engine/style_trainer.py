@@ -51,8 +51,7 @@ class HierStyleTrainerConfig(SparseStyleTrainerConfig):
 
     _target: Type = field(default_factory=lambda: HierStyleTrainer)
     coarse_method: tyro.conf.Suppress[Optional[Callable[[], SparseStyleTrainerConfig]]] = None
-    """Makes the config of stage 1, to train where there is no coarse run; a module's function, as config.yml names
-    it."""
+    """Makes the config of stage 1, to train where there is no coarse run; a module's function, named in config.yml."""
 
 
 class HierStyleTrainer(SparseStyleTrainer):
@@ -83,7 +82,6 @@ class HierStyleTrainer(SparseStyleTrainer):
         if before.get("backbone", {}).get("sha256") == self._backbone["sha256"]:
             self._backbone = before["backbone"]
         if self.resumed is None:
-            self._check_encoding(pipeline)
             self._begin(pipeline)
         self.config = replace(self.config, pipeline=pipeline)
         super().setup(test_mode)
@@ -94,17 +92,14 @@ class HierStyleTrainer(SparseStyleTrainer):
                 for _ in warm_start(self.pipeline, self.pipeline.task, self.optimizers):
                     warming.advance()
 
-    def _check_encoding(self, pipeline: HierStylePipelineConfig) -> None:
+    def _begin(self, pipeline: HierStylePipelineConfig) -> None:
+        """Finds the coarse run of a new run, and decides what is simulated: as there, the rest by its field."""
         rows = pipeline.model.features_per_level
         if pipeline.model.fine_encoding == "tiny-cuda-nn" and not has_tiny_cuda_nn(torch.device(self.device), rows):
             raise InputError(
                 "--pipeline.model.fine-encoding is tiny-cuda-nn, which isn't installed here, finds no GPU, or has no "
-                f"rows of {rows} features (but of 1, 2, 4 and 8); leave the setting out: the hash grid has kernels of "
-                "its own."
+                f"rows of {rows} features (but of 1, 2, 4 and 8); leave it out: the hash grid has kernels of its own."
             )
-
-    def _begin(self, pipeline: HierStylePipelineConfig) -> None:
-        """Finds the coarse run of a new run, and decides what is simulated: as there, the rest by its field."""
         manager: FewShotDataManager = pipeline.datamanager.setup(device="cpu", test_mode="inference")
         scene = manager.scene
         decided = decide(scene, pipeline.effects)

@@ -130,7 +130,7 @@ class SparseStyleTrainer(Trainer, ABC):
         for source in (self.config.load_dir, self.config.load_checkpoint):
             if source is not None and not source.exists():
                 raise InputError(
-                    f"There is nothing to resume at {source}; name a folder of checkpoints, or one of them."
+                    f"There is nothing to resume at {source}; name a folder of checkpoints or one of them."
                 )
         folder, step = self.config.load_dir, self.config.load_step
         if folder is None:

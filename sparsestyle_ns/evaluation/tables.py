@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Dict, List, Optional, Sequence, Tuple
 
 from rich.console import Console
+from rich.table import Column
 from rich.table import Table as RichTable
 
 from sparsestyle_ns.metrics.art_fid import why_left_out
@@ -46,10 +47,9 @@ class Table:
 
     def print(self) -> None:
         """Prints it."""
-        printed = RichTable(title=self.title, title_justify="left", caption=self.note or None, caption_justify="left")
-        printed.add_column("")
-        for column in self.columns:
-            printed.add_column(column, justify="right")
+        columns = [Column(name, justify="right") for name in self.columns]
+        words = {"title": self.title, "caption": self.note or None}
+        printed = RichTable("", *columns, **words, title_justify="left", caption_justify="left")
         for name, cells in self.rows:
             printed.add_row(name, *(cell or "–" for cell in cells), style="italic dim" if name in self.cited else None)
         Console().print(printed)

@@ -86,12 +86,11 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     def targets_of(self, style: StyleInputs, device: torch.device) -> StyleTargets:
         """A painting as the feature network sees it, with these settings; the network moves to the device."""
         image, backbone = style.painting.pixels.to(device), style.backbone.to(device)
-        losses = [name for name, weight in self.loss_weights.items() if weight > 0]
-        side = self.style_side or self.feature_side
-        return StyleTargets(backbone, image, self.feature_side, side, self.style_features, losses)
+        sides = self.feature_side, self.style_side or self.feature_side
+        return StyleTargets(backbone, image, *sides, self.style_features, list(self.weights_at(0)))
 
     def weights_at(self, step: int) -> Dict[str, float]:
-        """The weight of each loss in an iteration; that of the content loss is λ(t) (Eq. 6)."""
+        """The weight of each loss that is on, in an iteration; that of the content loss is λ(t) (Eq. 6)."""
         weights = {name: weight for name, weight in self.loss_weights.items() if weight > 0}
         if "content" in weights:
             weights["content"] = content_weight(step, weights["content"], self.content_decay, self.content_steps)

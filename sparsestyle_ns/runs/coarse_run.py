@@ -52,7 +52,7 @@ def under(state: Dict[str, Tensor], prefix: str) -> Dict[str, Tensor]:
 
 
 def read_coarse_run(path: Path) -> CoarseRun:
-    """Reads a run given by its folder or its config.yml; InputError where it is no coarse-fewshot run with a checkpoint."""
+    """Reads a run by its folder or its config.yml; InputError where it is no coarse-fewshot run with a checkpoint."""
     folder = path.parent if path.name == "config.yml" else path
     if not (folder / "config.yml").is_file():
         raise InputError(
