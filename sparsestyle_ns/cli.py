@@ -1,7 +1,6 @@
 """`sparsestyle ...`: what has no ns-* command of its own.
 
-A subcommand is a class of options, whose docstrings are its help, and a function, which is imported when it runs, so
-that help is there at once.
+A subcommand is a class of options, whose docstrings are its help, and a function, imported when it runs: help is fast.
 """
 
 import importlib

@@ -26,10 +26,8 @@ def adam(lr: float, scheduler: Optional[SchedulerConfig] = None) -> Dict[str, An
 def method(
     kind: Type[SparseStyleTrainerConfig], description: str, steps_per_log: int, **settings: Any
 ) -> MethodSpecification:
-    """A method, with what both stages have in common.
-
-    Without nerfstudio's table and its profile at the end: the trainer has a bar and a last line of its own.
-    """
+    """A method, with what both stages have in common."""
+    # Without nerfstudio's table and its profile at the end: the trainer has a bar and a last line of its own.
     local = LocalWriterConfig(enable=False)
     config = kind(
         steps_per_eval_batch=0,

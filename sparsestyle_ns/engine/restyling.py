@@ -11,7 +11,7 @@ import time
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
-from typing import ContextManager, Dict, Iterator, NamedTuple, Optional
+from typing import ContextManager, Dict, Iterator, NamedTuple, Optional, Tuple
 
 import torch
 import yaml
@@ -21,7 +21,7 @@ from sparsestyle_ns.effects.registry import decide_again
 from sparsestyle_ns.engine.style_trainer import style_notes
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.engine.training import check_skipped, training_step, warm_start
-from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleInputs, StyleTask
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleTask
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path, write_checkpoint
 from sparsestyle_ns.runs.run_folder import read_config
 from sparsestyle_ns.runs.scene_record import RECORD_FILE, save_thumbnail
@@ -63,10 +63,6 @@ class Workshop:
             raise InputError("Several processes train this scene together; restyle it in ns-viewer, once it is saved.")
         self.pipeline, self.folder, self.lock = pipeline, folder, lock
 
-    def config(self) -> SparseStyleTrainerConfig:
-        """The run's config, as it is by now."""
-        return read_config(self.folder)
-
     @functools.cached_property
     def backbone(self) -> Backbone:
         """The feature network that the pipeline has, else one with the weights that it would take."""
@@ -89,7 +85,7 @@ class Restyling:
 
     def __init__(self, workshop: Workshop, image: Painting, iterations: Optional[int] = None) -> None:
         self.workshop, self.pipeline, self.image = workshop, workshop.pipeline, image
-        self.config = workshop.config()
+        self.config: SparseStyleTrainerConfig = read_config(workshop.folder)  # as it is by now
         self.iterations = self.config.max_num_iterations if iterations is None else iterations
         if self.iterations < 1:
             raise InputError(f"A style needs at least 1 iteration, and {self.iterations} were asked for.")
@@ -100,7 +96,7 @@ class Restyling:
     def __iter__(self) -> Iterator[Progress]:
         yield Progress(f"Looking at {self.image.name}")
         pipeline, total = self.pipeline, self.iterations
-        targets = pipeline.config.targets_of(StyleInputs(self.image, self.workshop.backbone), pipeline.device)
+        targets = pipeline.config.targets_of(self.image, self.workshop.backbone, pipeline.device)
         scene = replace(pipeline.datamanager.scene, style_image=self.image.pixels)
         self.effects = decide_again(pipeline.effects, "palette", scene)  # what depends on the painting
         if pipeline.scene_views is None:
@@ -119,14 +115,12 @@ class Restyling:
 
     def _step(self, task: StyleTask, step: int) -> Dict[str, float]:
         """One iteration, as the trainer makes it."""
-        metrics: Dict[str, Tensor | float] = {}
 
-        def compute_losses(step: int) -> Dict[str, Tensor]:
+        def compute_losses() -> Tuple[Dict[str, Tensor], Dict[str, Tensor | float]]:
             _, losses = self.pipeline.losses(task, step)
-            metrics.update(losses.metrics())
-            return losses.terms()
+            return losses.terms(), losses.metrics()
 
-        training_step(self.optimizers, compute_losses, step)
+        *_, metrics = training_step(self.optimizers, compute_losses, step)
         advice = "try another image, or a lower learning rate in the run's config.yml."
         check_skipped(self.optimizers, self.config.max_skipped_steps, step, advice)
         return {name: float(value) for name, value in metrics.items()}
@@ -134,7 +128,7 @@ class Restyling:
     def save(self) -> Path:
         """Saves the style as a run of its own beside the one in the viewer; returns its folder.
 
-        It is there as a whole or not at all: what fails leaves nothing. OSError or RuntimeError where it can't be saved.
+        It is there as a whole or not at all. OSError or RuntimeError where it can't be written.
         """
         runs = self.workshop.folder.parent
         hidden = Path(tempfile.mkdtemp(prefix=".restyling-", dir=runs))

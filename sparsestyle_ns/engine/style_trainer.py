@@ -19,7 +19,7 @@ from sparsestyle_ns.engine.training import warm_start
 from sparsestyle_ns.field_components.tiny_cuda_grid import has_tiny_cuda_nn
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
-from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig, StyleInputs
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes
 from sparsestyle_ns.runs.coarse_run import CoarseRun, check_scene, find_coarse_run, read_coarse_run
 from sparsestyle_ns.runs.run_folder import COARSE_METHOD
@@ -62,9 +62,8 @@ class HierStyleTrainer(SparseStyleTrainer):
     pipeline: HierStylePipeline
     _coarse_run: Optional[CoarseRun] = None
     """Of a new run."""
-    _style: StyleInputs
-    _backbone: Dict[str, str]
-    """The feature network's description; in a run that is gone on with, how it was found when that began."""
+    _description: Dict[str, str]
+    """Of the feature network; in a run that is gone on with, how it was found when that began."""
 
     @exit_on_input_error
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
@@ -76,17 +75,17 @@ class HierStyleTrainer(SparseStyleTrainer):
         before: CheckpointNotes = self.resumed or {}
         if "coarse_field" in before:  # not in a coarse run's; loading that says what is wrong
             _adopt_notes(pipeline, before)
-        self._style = pipeline.load_style()
-        self._backbone = asdict(self._style.backbone.description)
-        pipeline.backbone = self._backbone["name"]
-        if before.get("backbone", {}).get("sha256") == self._backbone["sha256"]:
-            self._backbone = before["backbone"]
+        self._painting, self._backbone = pipeline.load_style()
+        self._description = asdict(self._backbone.description)
+        pipeline.backbone = self._description["name"]
+        if before.get("backbone", {}).get("sha256") == self._description["sha256"]:
+            self._description = before["backbone"]
         if self.resumed is None:
             self._begin(pipeline)
         self.config = replace(self.config, pipeline=pipeline)
         super().setup(test_mode)
         if comms.is_main_process():
-            save_thumbnail(self.base_dir, self._style.painting)
+            save_thumbnail(self.base_dir, self._painting)
         if self._start_step == 0:
             with bar("Warm start", pipeline.warm_start_steps) as warming:
                 for _ in warm_start(self.pipeline, self.pipeline.task, self.optimizers):
@@ -106,16 +105,16 @@ class HierStyleTrainer(SparseStyleTrainer):
         run = self._coarse_run = self._find_coarse(manager, decided)
         pipeline.coarse_run = run.folder.resolve()
         pipeline.model.coarse_field = copy.deepcopy(run.config.pipeline.model.coarse_field)
-        scene.coarse_density, scene.style_image = run.density(decided), self._style.painting.pixels
+        scene.coarse_density, scene.style_image = run.density(decided), self._painting.pixels
         pipeline.decided = decide(scene, pipeline.effects, decided)
 
     def notes(self) -> CheckpointNotes:
         """See `style_notes`."""
-        return style_notes(self.pipeline, self.pipeline.effects, self._backbone)
+        return style_notes(self.pipeline, self.pipeline.effects, self._description)
 
     def _load_checkpoint(self) -> None:
         super()._load_checkpoint()
-        self.pipeline.targets = self.pipeline.config.targets_of(self._style, self.pipeline.device)
+        self.pipeline.targets = self.pipeline.config.targets_of(self._painting, self._backbone, self.pipeline.device)
         if self._coarse_run is not None:
             self.pipeline.model.adopt_coarse(self._coarse_run.model_state())
 

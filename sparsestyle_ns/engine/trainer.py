@@ -209,17 +209,13 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def train_iteration(self, step: int) -> Tuple[Tensor, Dict[str, Tensor], Dict[str, Tensor]]:
         """One iteration: its loss, the losses by name, and metrics."""
-        losses: Dict[str, Tensor] = {}
-        metrics: Dict[str, Tensor] = {}
 
-        def compute_losses(step: int) -> Dict[str, Tensor]:
-            nonlocal losses, metrics
+        def compute_losses() -> Tuple[Dict[str, Tensor], Dict[str, Tensor]]:
             with torch.autocast(self.pipeline.device.type, enabled=self.mixed_precision):
-                _, losses, metrics = self.pipeline.get_train_loss_dict(step)
-            return losses
+                return self.pipeline.get_train_loss_dict(step)[1:]
 
         scaling = self.grad_scaler, self.gradient_accumulation_steps
-        loss = training_step(self.optimizers, compute_losses, step, *scaling)
+        loss, losses, metrics = training_step(self.optimizers, compute_losses, step, *scaling)
         self._log_step(step, metrics)
         self.stop_training = step + 1 == self.config.max_num_iterations  # nerfstudio counts from where it resumed
         return loss, losses, metrics

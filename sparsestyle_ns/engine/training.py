@@ -4,7 +4,7 @@ import copy
 import functools
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Callable, Dict, Iterator, Mapping, Optional, Tuple
+from typing import Any, Callable, Dict, Iterator, Mapping, Optional, Tuple
 
 import torch
 from jaxtyping import Float
@@ -33,15 +33,15 @@ class FusedAdamConfig(AdamOptimizerConfig):
 
 def training_step(
     optimizers: Optimizers,
-    compute_losses: Callable[[int], Mapping[str, Float[Tensor, ""]]],
+    compute_losses: Callable[[], Tuple[Dict[str, Float[Tensor, ""]], Dict[str, Any]]],
     step: int,
     scaler: Optional[GradScaler] = None,
     accumulate: Optional[Mapping[str, int]] = None,
-) -> Float[Tensor, ""]:
-    """Minimises a sum of losses by one step of the optimisers and their schedules; returns it without its gradient.
+) -> Tuple[Float[Tensor, ""], Dict[str, Float[Tensor, ""]], Dict[str, Any]]:
+    """Minimises a sum of losses by one step of the optimisers and their schedules; returns it, the losses and metrics.
 
     Args:
-        compute_losses: gives the losses of an iteration by name, weighted.
+        compute_losses: gives the losses by name, weighted, and metrics.
         step: the iteration, from 0.
         scaler: of gradients, for half precision.
         accumulate: of a group of parameters, the iterations whose gradients are added up for a step; 1 if not named.
@@ -49,7 +49,8 @@ def training_step(
     scaler, every = scaler or GradScaler(enabled=False), accumulate or {}
     groups = list(optimizers.parameters)
     optimizers.zero_grad_some([name for name in groups if step % every.get(name, 1) == 0])
-    loss = functools.reduce(torch.add, compute_losses(step).values())
+    losses, metrics = compute_losses()
+    loss = functools.reduce(torch.add, losses.values())
     scaler.scale(loss).backward()
     due = [name for name in groups if (step + 1) % every.get(name, 1) == 0]
     optimizers.optimizer_scaler_step_some(scaler, due)
@@ -58,7 +59,7 @@ def training_step(
     if scale <= scaler.get_scale():  # a smaller one says that the step was skipped
         for scheduler in optimizers.schedulers.values():
             scheduler.step()
-    return loss.detach()
+    return loss.detach(), losses, metrics
 
 
 def warm_start(pipeline: HierStylePipeline, task: StyleTask, following: Optimizers) -> Iterator[int]:
@@ -70,7 +71,7 @@ def warm_start(pipeline: HierStylePipeline, task: StyleTask, following: Optimize
     adam = {"fields": {"optimizer": FusedAdamConfig(lr=rate), "scheduler": None}}
     optimizers = FiniteOptimizers(adam, {"fields": list(task.style.parameters())})
     for step in range(pipeline.config.warm_start_steps):
-        training_step(optimizers, lambda step: pipeline.warm_start_loss(task, step), step)
+        training_step(optimizers, lambda step=step: (pipeline.warm_start_loss(task, step), {}), step)
         yield step
     optimizers.zero_grad_all()
 
@@ -123,6 +124,7 @@ class Training:
         self.pipeline.train()
         for callback in self.callbacks:
             callback.run_callback_at_location(self.num_steps, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-        loss = training_step(self.optimizers, lambda step: self.pipeline.get_train_loss_dict(step)[1], self.num_steps)
+        step = self.num_steps
+        loss, *_ = training_step(self.optimizers, lambda: self.pipeline.get_train_loss_dict(step)[1:], step)
         self.num_steps += 1
         return loss

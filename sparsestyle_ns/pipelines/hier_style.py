@@ -25,13 +25,6 @@ from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress import say
 
 
-class StyleInputs(NamedTuple):
-    """What a style is made from, read once a run: the painting, and the feature network."""
-
-    painting: Painting
-    backbone: Backbone
-
-
 @dataclass
 class HierStylePipelineConfig(CheckedPipelineConfig):
     """Settings of stage 2."""
@@ -66,28 +59,26 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     cache_gigabytes: Optional[float] = None
     """Memory for what never changes of the views; None: a quarter of what is free."""
 
-    def load_style(self) -> StyleInputs:
+    def load_style(self) -> Tuple[Painting, Backbone]:
         """The painting and the feature network, on the CPU; InputError where these or a setting can't be used."""
         if self.style_features is not None and self.style_features < 1:
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
         for name, weight in self.loss_weights.items():
             if name not in LOSSES:
-                raise InputError(
-                    f"--pipeline.loss-weights names {name}, which is no loss; the losses are {', '.join(LOSSES)}."
-                )
+                known = ", ".join(LOSSES)
+                raise InputError(f"--pipeline.loss-weights names {name}, which is no loss; the losses are {known}.")
             if not 0.0 <= weight < math.inf:
                 raise InputError(f"--pipeline.loss-weights.{name} is {weight}; give a finite number, 0 or more.")
         if not any(self.loss_weights.values()):
             raise InputError("--pipeline.loss-weights turns every loss off; give one of them a weight above 0.")
         if self.style_image is None:
             raise InputError("There is no style image: name a painting with --style-image FILE.")
-        return StyleInputs(Painting.read(self.style_image), self.load_backbone(torch.device("cpu")))
+        return Painting.read(self.style_image), self.load_backbone(torch.device("cpu"))
 
-    def targets_of(self, style: StyleInputs, device: torch.device) -> StyleTargets:
+    def targets_of(self, painting: Painting, backbone: Backbone, device: torch.device) -> StyleTargets:
         """A painting as the feature network sees it, with these settings; the network moves to the device."""
-        image, backbone = style.painting.pixels.to(device), style.backbone.to(device)
-        sides = self.feature_side, self.style_side or self.feature_side
-        return StyleTargets(backbone, image, *sides, self.style_features, list(self.weights_at(0)))
+        sides, losses = (self.feature_side, self.style_side or self.feature_side), list(self.weights_at(0))
+        return StyleTargets(backbone.to(device), painting.pixels.to(device), *sides, self.style_features, losses)
 
     def weights_at(self, step: int) -> Dict[str, float]:
         """The weight of each loss that is on, in an iteration; that of the content loss is λ(t) (Eq. 6)."""
@@ -135,7 +126,7 @@ class HierStylePipeline(CheckedPipeline):
     ) -> List[TrainingCallback]:
         """Prepares the style and the views, as far as they aren't there already."""
         if self.targets is None:
-            self.targets = self.config.targets_of(self.config.load_style(), self.device)
+            self.targets = self.config.targets_of(*self.config.load_style(), self.device)
         self.announce(self.targets.backbone)
         self.task = self.new_task(self.model.residual, self.targets, self.effects)
         say(self.scene_views.report())
@@ -149,7 +140,7 @@ class HierStylePipeline(CheckedPipeline):
         if path is None or not path.is_file():
             say(f"The painting {path} isn't there any more, so nothing is measured against it.")
             return None
-        return self.config.targets_of(replace(self.config, style_image=path).load_style(), self.device)
+        return self.config.targets_of(*replace(self.config, style_image=path).load_style(), self.device)
 
     def warm_start_loss(self, task: StyleTask, step: int) -> Dict[str, Float[Tensor, ""]]:
         """How far c_f, on the coarse geometry, is from the content picture of one photo; not in the paper.

@@ -42,7 +42,6 @@ class SceneViews:
 
     Args:
         model: whose coarse field is final.
-        pixels, cameras: of the photos.
         novel_views: how many views between the photos there are.
         samples_per_chunk: samples that are rendered at once, at most.
         cache_gigabytes: memory for what never changes; None: a quarter of what is free.

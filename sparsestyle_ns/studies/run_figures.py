@@ -68,7 +68,7 @@ class PaintingMeasure:
         """
         if self._targets is None:
             settings = replace(settings, style_image=self.painting)
-            self._targets = settings.targets_of(settings.load_style(), torch.device("cpu"))
+            self._targets = settings.targets_of(*settings.load_style(), torch.device("cpu"))
             self._gram = gram_matrix(self._targets.style_rows())
         values, art_fid = [], ArtFID.against(self._targets.style_image)
         for index in track(range(0, len(frames.stylised), STYLE_EVERY), "Style and content"):
