@@ -46,7 +46,7 @@ def render_preview(pipeline: CheckedPipeline, longest_side: int) -> Float[Tensor
 
 
 def preview_path(run: Path, iterations: int) -> Path:
-    """Where the preview after so many iterations is in a run's folder."""
+    """Where a run's preview after so many iterations is."""
     return run / "previews" / f"after-{iterations:06d}.png"
 
 

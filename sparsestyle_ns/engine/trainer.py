@@ -65,23 +65,20 @@ class SparseStyleTrainerConfig(TrainerConfig):
     @exit_on_input_error
     def save_config(self) -> None:
         """Writes config.yml into the run's folder; `ns-train` calls it right before it starts processes."""
-        gpus = torch.cuda.device_count()
-        if self.machine.device_type == "cuda" and self.machine.num_devices > gpus:
+        machine, folder, gpus = self.machine, self.get_base_dir(), torch.cuda.device_count()
+        if machine.device_type == "cuda" and machine.num_devices > gpus:
             advice = "ask for fewer." if gpus else "give --machine.device-type cpu."
             raise InputError(
-                f"--machine.device-type is cuda and --machine.num-devices {self.machine.num_devices}, but torch finds "
+                f"--machine.device-type is cuda and --machine.num-devices {machine.num_devices}, but torch finds "
                 f"{gpus or 'no'} GPU{'s' * (gpus > 1)} here; {advice}"
             )
-        if self.machine.num_devices * self.machine.num_machines > 1:
+        if machine.num_devices * machine.num_machines > 1:
             prepare_launch()
         try:
-            self.get_base_dir().mkdir(parents=True, exist_ok=True)
-            write_whole(self.get_base_dir() / "config.yml", yaml.dump(self))
+            write_whole(folder / "config.yml", yaml.dump(self))
         except OSError as error:
-            raise InputError(
-                f"The run can't be saved in {self.get_base_dir()} ({error.strerror}); name a folder that can be "
-                "written to with --output-dir."
-            ) from error
+            where = f"{folder} ({error.strerror}); name a folder that can be written to with --output-dir."
+            raise InputError(f"The run can't be saved in {where}") from error
 
 
 class SparseStyleTrainer(Trainer, ABC):

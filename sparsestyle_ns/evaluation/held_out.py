@@ -32,7 +32,7 @@ from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.progress import track
 
 EVEN_SAMPLES = 64
-"""Even samples a ray on which `mean_effective_samples` counts: the number means something only with this one."""
+"""Even samples a ray on which `effective_samples` are counted: the number means something only with this one."""
 MIN_ACCUMULATION = 0.5
 """Rays with less weight than this show background, and have no surface to be sharp."""
 
@@ -112,9 +112,7 @@ def evaluate_held_out(
         if style is not None:
             values.append(style.view(outputs, photo, camera))
         else:
-            effective = mean_effective_samples(model, camera)
-            extra = {} if effective is None else {"effective_samples": effective}
-            values.append({**image_metrics(outputs["rgb"], photo), **extra})
+            values.append({**image_metrics(outputs["rgb"], photo), **sharpness_figures(model, camera)})
         if picture_folder is not None:
             picture_folder.mkdir(parents=True, exist_ok=True)
             _, pictures = model.get_image_metrics_and_images(outputs, {"image": photo})
@@ -169,8 +167,8 @@ def stylisation_figures(
 ) -> Dict[str, float]:
     """How strong the style of a view is, before (`…_before`) and after stylising, and how far its content has moved.
 
-    `style_loss` is the nearest neighbour feature matching of Eq. 5, `content_loss` its distance of features from the
-    unstylised view, any other loss of `targets` `NAME_loss`, and `gram_distance` that of `metrics.gram`. With
+    `style_loss` and `content_loss` are Eq. 5's: nearest neighbour feature matching, and the features' distance from the
+    unstylised view; other losses of `targets` are `NAME_loss`, and `gram_distance` is that of `metrics.gram`. With
     `accumulation`, only where the scene covers the picture: a background can't be stylised.
     """
     content = targets.features(coarse)
@@ -185,11 +183,8 @@ def stylisation_figures(
 
 
 @torch.no_grad()
-def mean_effective_samples(model: CoarseFewShotModel, camera: Cameras) -> Optional[float]:
-    """Mean of `effective_samples` over a view's rays that meet a surface, on `EVEN_SAMPLES` even samples.
-
-    None where no ray does: JSON has no word for a mean of nothing.
-    """
+def sharpness_figures(model: CoarseFewShotModel, camera: Cameras) -> Dict[str, float]:
+    """Mean `effective_samples`, on `EVEN_SAMPLES` even ones, of a view's rays that meet a surface, where one does."""
     rays = camera.generate_rays(camera_indices=0, keep_shape=False).flatten()
     counts = []
     for start in range(0, len(rays), model.config.eval_num_rays_per_chunk):
@@ -201,7 +196,7 @@ def mean_effective_samples(model: CoarseFewShotModel, camera: Cameras) -> Option
         weights = dense_weights(optical_depth(density, interval_lengths(segments, edges, model.space.unbounded)))
         counts.append(effective_samples(weights)[weights.sum(dim=-1) > MIN_ACCUMULATION])
     found = torch.cat(counts)
-    return float(found.mean()) if len(found) else None
+    return {"effective_samples": float(found.mean())} if len(found) else {}
 
 
 @dataclass
@@ -227,8 +222,7 @@ def render_path(model: HierStyleModel, cameras: Cameras) -> PathFrames:
     frames = PathFrames([], [], [])
     for index in track(range(len(cameras)), "Measuring path"):
         camera = cameras[index : index + 1].to(model.device)
-        with model.rendering("exact"):
-            outputs = model.get_outputs_for_camera(camera)
+        outputs = exact_outputs(model, camera)
         rays = camera.generate_rays(camera_indices=0, keep_shape=True)
         points = rays.origins + outputs["depth_coarse"] * rays.directions  # in the world in every space, NDC too
         focal, center = (float(camera.fx), float(camera.fy)), (float(camera.cx), float(camera.cy))

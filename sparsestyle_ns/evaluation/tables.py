@@ -29,6 +29,8 @@ LABELS: Dict[str, Tuple[str, int]] = {
 COARSE_QUALITY = ("psnr", "ssim", "lpips", "st_lpips", "effective_samples")
 STYLE_AND_CONTENT = ("style_loss", "gram_distance", "art_fid", "content_loss")
 PERCEPTUAL = ("rmse", "ssim", "lpips", "st_lpips")
+CONSISTENCY = [(f"{part}_{kind}", kind, f"{part} ") for part in ("short", "long") for kind in PERCEPTUAL]
+"""Columns of short- and long-range consistency, for `table_of`."""
 
 
 @dataclass
@@ -75,11 +77,6 @@ def table_of(
     return table
 
 
-def consistency_columns() -> List[Tuple[str, str, str]]:
-    """Columns of short- and long-range consistency."""
-    return [(f"{part}_{kind}", kind, f"{part} ") for part in ("short", "long") for kind in PERCEPTUAL]
-
-
 def report_tables(means: Dict[str, float], num_views: int) -> List[Table]:
     """The tables of one run's figures, as `sparsestyle evaluate` prints them."""
     views = f"{num_views} held-out view" + "s" * (num_views > 1)
@@ -94,7 +91,7 @@ def report_tables(means: Dict[str, float], num_views: int) -> List[Table]:
     tables.append(table_of(f"Style and content, {views}", kept, rows, why_left_out(means)))
     if "short_rmse" in means:
         ceiling = {key[len("ceiling_") :]: value for key, value in means.items() if key.startswith("ceiling_")}
-        columns = [*consistency_columns(), *((f"{part}_visible", "visible", f"{part} ") for part in ("short", "long"))]
+        columns = [*CONSISTENCY, *((f"{part}_visible", "visible", f"{part} ") for part in ("short", "long"))]
         rows = [("stylised", means), ("unstylised (the ceiling)", ceiling)]
         tables.append(table_of("Consistency on the measuring path, frames t and t + 1, t and t + 7", columns, rows))
     return tables
