@@ -21,7 +21,7 @@ from torch import Tensor
 
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.engine.hints import finish, ns_train_style, resume_command
-from sparsestyle_ns.engine.previews import preview_steps, render_preview, save_preview
+from sparsestyle_ns.engine.previews import preview_steps, write_preview
 from sparsestyle_ns.engine.training import check_skipped, training_step
 from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
@@ -247,10 +247,8 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def eval_iteration(self, step: int) -> None:
         """What nerfstudio evaluates after an iteration, and the preview after some; then Ctrl-C ends training."""
-        if step + 1 in self._preview_steps and comms.is_main_process():
-            picture = render_preview(self.pipeline, self.config.preview_side)
-            writer.put_image(name="Preview", image=picture, step=step + 1)
-            save_preview(picture, self.base_dir, step + 1)
+        if step + 1 in self._preview_steps:
+            write_preview(self.pipeline, self.base_dir, step + 1, self.config.preview_side)
         super().eval_iteration(step)
         # Not before: what callbacks decide after an iteration wouldn't be in the checkpoint.
         self._interrupted = any_process(self._interrupted, self.pipeline.device)
