@@ -117,9 +117,8 @@ class HierStylePipeline(CheckedPipeline):
 
     def freeze_views(self) -> SceneViews:
         """The scene's views, with all that depends on no style."""
-        config, manager = self.config, self.datamanager
-        limits = config.samples_per_chunk, config.cache_gigabytes
-        return SceneViews(self.model, manager.pixels, manager.train_dataset.cameras, config.novel_views, *limits)
+        sizes = self.config.novel_views, self.config.samples_per_chunk, self.config.cache_gigabytes
+        return SceneViews(self.model, self.datamanager, *sizes)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

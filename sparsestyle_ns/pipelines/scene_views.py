@@ -14,7 +14,7 @@ from sparsestyle_ns.core.camera_paths import at_poses, poses_between
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.models.hier_style import HierStyleModel
-from sparsestyle_ns.pipelines.datamanager import TrainingPixels
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, TrainingPixels
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.render import accumulation_of, seen_behind
 from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
@@ -51,12 +51,12 @@ class SceneViews:
     def __init__(
         self,
         model: HierStyleModel,
-        pixels: TrainingPixels,
-        cameras: Cameras,
+        manager: FewShotDataManager,
         novel_views: int,
         samples_per_chunk: int,
         cache_gigabytes: Optional[float],
     ) -> None:
+        pixels = manager.pixels
         self.model, self.samples_per_chunk = model, samples_per_chunk
         self.num_photos = len(pixels.sizes)
         if cache_gigabytes is None:
@@ -65,7 +65,7 @@ class SceneViews:
             cache_gigabytes = free / 2**30 / 4 / num_processes()
         self._bytes_left = cache_gigabytes * 2**30
         self.views = [self._photo_view(pixels, index) for index in track(range(self.num_photos), "Caching views")]
-        novel = cameras_between(cameras, novel_views)
+        novel = cameras_between(manager.train_dataset.cameras, novel_views)
         self.views += [self._novel_view(camera) for camera in track(novel, "Caching novel views")]
 
     def _freeze(self, origins: Tensor, directions: Tensor) -> FrozenView:

@@ -3,16 +3,18 @@
 import copy
 import sys
 from contextlib import redirect_stdout
+from typing import List
 
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 
 from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.effects.base import Decisions, EffectSettings
 from sparsestyle_ns.effects.registry import decide
-from sparsestyle_ns.engine.hints import after_effects, finish
+from sparsestyle_ns.engine.hints import PAINTING, finish, flags_of, parser_arguments
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.prepare.prepare_options import EffectsOptions
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
+from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD
 from sparsestyle_ns.runs.scene_record import record_scene
 from sparsestyle_ns.style.painting import Painting
 
@@ -27,9 +29,18 @@ def print_effects(options: EffectsOptions) -> None:
     with redirect_stdout(sys.stderr):  # what dataparsers print must not get into the JSON
         decisions = measure_scene(parser, options)
     print(decisions.json() if options.json else decisions.text(), flush=True)
-    views = options.num_views, options.view_ids
     with redirect_stdout(sys.stderr if options.json else sys.stdout):
-        finish(None, after_effects(parser, options.data, *views, options.coarse_run, options.style_image))
+        finish(None, next_command(parser, options))
+
+
+def next_command(dataparser: DataParserConfig, options: EffectsOptions) -> List[str]:
+    """Training on the scene, with the painting where there is a coarse run."""
+    command = ["ns-train", COARSE_METHOD]
+    if options.coarse_run is not None:
+        command = ["ns-train", STYLE_METHOD, "--style-image", str(options.style_image or PAINTING)]
+    command += flags_of("--coarse-run", options.coarse_run)
+    command += flags_of("--num-views", options.num_views) + flags_of("--view-ids", options.view_ids)
+    return [*command, "--data", str(options.data), *parser_arguments(dataparser)]
 
 
 def measure_scene(dataparser: DataParserConfig, options: EffectsOptions) -> Decisions:
