@@ -137,7 +137,11 @@ class Restyling:
             self._write_contents(new)
             while (folder := runs / datetime.now().strftime("%Y-%m-%d_%H%M%S")).exists():  # as nerfstudio names them
                 time.sleep(0.1)  # until the second is over in which another run began
-            self._write_config(new, folder.resolve())
+            config = copy.deepcopy(self.config)
+            config.timestamp, config.max_num_iterations = folder.name, self.iterations
+            config.load_dir = config.load_step = config.load_checkpoint = None
+            config.pipeline.style_image, config.pipeline.decided = folder.resolve() / self._painting, self.effects
+            write_whole(new / "config.yml", yaml.dump(config))
             return new.rename(folder)
         finally:
             shutil.rmtree(hidden, ignore_errors=True)
@@ -154,14 +158,6 @@ class Restyling:
         path = checkpoint_path(new / self.config.relative_model_dir, self.iterations - 1)
         state = {**self.pipeline.state_dict(), **own}
         write_checkpoint(path, self.iterations - 1, state, self.optimizers, self.notes())
-
-    def _write_config(self, new: Path, folder: Path) -> None:
-        """Writes the config of a run that will lie in `folder`."""
-        config = copy.deepcopy(self.config)
-        config.timestamp, config.max_num_iterations = folder.name, self.iterations
-        config.load_dir = config.load_step = config.load_checkpoint = None
-        config.pipeline.style_image, config.pipeline.decided = folder / self._painting, self.effects
-        write_whole(new / "config.yml", yaml.dump(config))
 
     def notes(self) -> CheckpointNotes:
         """What its checkpoint says beside the state."""

@@ -98,8 +98,7 @@ class CheckedPipeline(VanillaPipeline):
 
     def announce(self, backbone: Backbone) -> None:
         """Says which feature network is in use, and where its weights came from."""
-        description = backbone.description
-        CONSOLE.print(f"Features: {description.name}, {description.source}", soft_wrap=True)
+        CONSOLE.print(f"Features: {backbone.description.name}, {backbone.description.source}", soft_wrap=True)
 
     def style_targets(self, style_image: Optional[Path] = None) -> Optional[StyleTargets]:
         """The painting to measure against, the run's own or another, where the method has one and it is still there."""

@@ -56,9 +56,8 @@ class SceneRecord:
         for name, on in self.effects.items():
             theirs = other.effects.get(name, False)
             if on != theirs:
-                word = "on" if theirs else "off"
-                flag = f"--pipeline.effects.{name.replace('_', '-')} {word}"
-                return f"it was made with the effect {name} {word}, as by {flag}"
+                word, flag = "on" if theirs else "off", f"--pipeline.effects.{name.replace('_', '-')}"
+                return f"it was made with the effect {name} {word}, as by {flag} {word}"
         if self.background_color != other.background_color:
             return f"its background has the colour {other.background_color} in place of {self.background_color}"
         mine, theirs = [*self.cameras, self.scene_box], [*other.cameras, other.scene_box]
