@@ -8,8 +8,8 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from sparsestyle_ns.data.scene_info import NDC
 from sparsestyle_ns.effects.background import background_color
 from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.effects.exposure import build_exposure
 from sparsestyle_ns.effects.layouts import build_space
+from sparsestyle_ns.effects.matched_colors import build_exposure
 
 
 class SceneModel(Model):

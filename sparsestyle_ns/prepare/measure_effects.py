@@ -20,11 +20,7 @@ from sparsestyle_ns.style.painting import Painting
 
 
 def print_effects(options: EffectsOptions) -> None:
-    """Prints the decisions, and what to type next; beside JSON, that goes to stderr.
-
-    Raises:
-        InputError: something can't be read, or the run is of another scene.
-    """
+    """Prints the decisions, and what to type next; beside JSON, that goes to stderr."""
     parser = parse_dataparser(options.dataparser, options.data)
     with redirect_stdout(sys.stderr):  # what dataparsers print must not get into the JSON
         decisions = measure_scene(parser, options)
