@@ -1,6 +1,5 @@
 """`sparsestyle gallery`: what its page shows of runs is their files, renders, films, and what was measured of them."""
 
-import statistics
 from itertools import zip_longest
 from pathlib import Path
 from typing import Dict, List, Optional, Sequence, Tuple
@@ -14,7 +13,7 @@ from sparsestyle_ns.data.photos import PhotoDataset, at_size
 from sparsestyle_ns.data.view_selection import evenly_spaced
 from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.engine.loading import load_run
-from sparsestyle_ns.evaluation.held_out import HeldOutReport, by_figure, exact_outputs, saved_report
+from sparsestyle_ns.evaluation.held_out import HeldOutReport, exact_outputs, means_of, saved_report
 from sparsestyle_ns.evaluation.tables import Table, report_tables, table_of
 from sparsestyle_ns.gallery.film import as_pixels, make_film, read_film
 from sparsestyle_ns.gallery.gallery_options import GalleryOptions
@@ -150,7 +149,7 @@ def _style_picture(path: Optional[Path]) -> Optional[Picture]:
 
 def _views_table(views: Sequence[Dict[str, float]]) -> Table:
     """Means over the views that are shown of what the model measured of them."""
-    means = {key: statistics.fmean(values) for key, values in by_figure(views).items()}
+    means = means_of(views)
     columns = [(f"coarse_{key}", key, "coarse ") for key in ("psnr", "ssim", "lpips")]
     columns.append(("content_ssim", "content_ssim", "stylised "))
     return table_of(f"Mean of the views above, {len(views)}", columns, [("", means)])

@@ -19,7 +19,7 @@ from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
 from sparsestyle_ns.rendering.look import RENDER_MODES, Look
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes
-from sparsestyle_ns.runs.thumbnail import find_thumbnail
+from sparsestyle_ns.runs.scene_record import find_thumbnail
 from sparsestyle_ns.utils.files import free_name
 from sparsestyle_ns.viewer.adjustments import begin_at_central_photo, hide_frustums, keep_outputs
 from sparsestyle_ns.viewer.baking import Baker

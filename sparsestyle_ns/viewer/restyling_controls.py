@@ -12,6 +12,7 @@ from viser import GuiApi
 
 from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
 from sparsestyle_ns.fields.fine import StylisedField
+from sparsestyle_ns.runs.run_folder import read_config
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.viewer.styles import Facts, style_facts
@@ -67,7 +68,7 @@ class RestylingControls:
         iterations, said = 0, ""
         try:
             self.workshop = open_workshop()
-            iterations = self.workshop.config().max_num_iterations
+            iterations = read_config(self.workshop.folder).max_num_iterations
         except InputError as error:
             said = f"**No restyling.** {plain(str(error))}"
         with gui.add_folder("Another style", expand_by_default=False):

@@ -448,7 +448,7 @@ def test_restyling_takes_the_trainers_steps(runs: SimpleNamespace, painting: Pat
     pipeline = training.pipeline
     fresh = pipeline.model.new_style()
     pipeline.model.residual.load_state_dict(fresh.state_dict())
-    for _ in warm_start(pipeline, pipeline.task, config.optimizers["fields"]["optimizer"].lr):
+    for _ in warm_start(pipeline, pipeline.task, training.optimizers):
         pass
     for _ in range(3):
         training.step()
