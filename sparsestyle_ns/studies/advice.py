@@ -1,9 +1,8 @@
 """What was found, in plain words; every number comes from the measurements."""
 
-from typing import List, Optional, Sequence
+from typing import List, Sequence
 
-from sparsestyle_ns.studies.curves import Curve, Point
-from sparsestyle_ns.studies.pareto import decibels_lost, time_factor_of_a_decibel
+from sparsestyle_ns.studies.curves import Curve, Point, decibels_lost, time_factor_of_a_decibel
 from sparsestyle_ns.utils import progress
 
 SMALL_GAIN = 0.05
@@ -25,23 +24,19 @@ def times(factor: float) -> str:
 
 
 def recommendation(curves: Sequence[Curve]) -> List[str]:
-    """A line for each curve that has points: how long to train, and what to turn."""
-    return [
-        iterations_line(curve) if curve.flag == "--max-num-iterations" else setting_line(curve)
-        for curve in curves
-        if curve.points
-    ]
+    """A line for each curve, all of which have points: how long to train, and what to turn."""
+    return [iterations_line(curve) if curve.flag == "--max-num-iterations" else setting_line(curve) for curve in curves]
 
 
 def iterations_line(curve: Curve) -> str:
     """How many iterations are enough for a draft, how many gave the best result, and what more would cost."""
     draft, front = curve.recommended, curve.front
-    assert draft is not None
     uses = {"for a draft": draft} if draft is front[-1] else {"for a draft": draft, "for the best result": front[-1]}
     words = ", ".join(f"{point.setting} {use} ({_result(curve, point)})" for use, point in uses.items())
-    factor = _last_factor(front) if curve.error == "psnr" else None
-    if factor is not None:
-        words += f"; after that 1 dB more takes {times(factor)} the time"
+    if curve.error == "psnr" and len(front) > 1:
+        ends = [(point.median("train_seconds"), point.median("psnr")) for point in front[-2:]]
+        # On a front both grow, so there is a factor.
+        words += f"; after that 1 dB more takes {times(time_factor_of_a_decibel(*ends[0], *ends[1]))} the time"
     return f"{curve.title} ({curve.flag}): {words}{_remarks(draft, front[-1])}"
 
 
@@ -51,20 +46,10 @@ def _result(curve: Curve, point: Point) -> str:
     return f"{duration(point.median(curve.time))}, {quality}"
 
 
-def _last_factor(front: Sequence[Point]) -> Optional[float]:
-    """What a decibel costs at the end of the front."""
-    if len(front) < 2:
-        return None
-    earlier, later = ((point.median("train_seconds"), point.median("psnr")) for point in front[-2:])
-    return time_factor_of_a_decibel(*earlier, *later)
-
-
 def setting_line(curve: Curve) -> str:
     """Whether to keep the preset's value, and what another would change."""
-    chosen, preset = curve.recommended, curve.last(curve.preset)
-    assert chosen is not None
     # Runs of one length end at the same time: their ends are what can be compared.
-    chosen = curve.last(chosen.setting) or chosen
+    chosen, preset = curve.last(curve.recommended.setting), curve.last(curve.preset)
     if preset is None:
         words = f"use {chosen.setting}; the preset's {curve.preset} wasn't measured"
     elif chosen.setting == preset.setting:
@@ -99,8 +84,7 @@ def _faster_one(curve: Curve, preset: Point) -> str:
 
 def _compared(curve: Curve, point: Point, other: Point) -> str:
     """1.9× as fast, 19.00 dB instead of 18.00."""
-    factor = other.median(curve.time) / point.median(curve.time)
-    parts = []
+    factor, parts = other.median(curve.time) / point.median(curve.time), []
     if abs(factor - 1.0) > SMALL_GAIN:
         parts.append(f"{times(factor)} as fast" if factor > 1 else f"{times(1 / factor)} the time")
     if curve.own_error is not None:
@@ -116,9 +100,7 @@ def _compared(curve: Curve, point: Point, other: Point) -> str:
 
 def _remarks(*points: Point) -> str:
     """The end of a line: what makes its figures weak, if anything does."""
-    remarks = []
-    if all(max(map(len, point.values.values())) < 2 for point in points):
-        remarks.append("measured once")
-    if any(point.busy for point in points):
-        remarks.append("the machine was busy")
-    return f" [{'; '.join(remarks)}]" if remarks else "."
+    once = all(max(map(len, point.values.values())) < 2 for point in points)
+    remarks = {"measured once": once, "the machine was busy": any(point.busy for point in points)}
+    said = "; ".join(remark for remark, holds in remarks.items() if holds)
+    return f" [{said}]" if said else "."

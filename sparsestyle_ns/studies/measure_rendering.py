@@ -3,7 +3,6 @@
 import contextlib
 import copy
 import functools
-import itertools
 import math
 from typing import Callable, ContextManager, Dict, Iterator, List, Mapping, Optional, Sequence, Tuple
 
@@ -16,15 +15,15 @@ from torch import Tensor
 
 from sparsestyle_ns.core.occupancy import Occupancy
 from sparsestyle_ns.core.precision import Precision, autocast, multiplies_bfloat16, multiplies_tf32
+from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
-from sparsestyle_ns.rendering.baked import render_baked
+from sparsestyle_ns.rendering.baked import BakedVolume, render_baked
 from sparsestyle_ns.rendering.render import POINTS_PER_CALL, render_coarse
-from sparsestyle_ns.studies.curves import Curve, Values
-from sparsestyle_ns.studies.pareto import decibels, observed_order
-from sparsestyle_ns.studies.study import flag_of, get_setting, with_setting
-from sparsestyle_ns.studies.time_budget import Budget, Case, OutOfTimeError, Plan, in_turns
-from sparsestyle_ns.studies.workbench import Model, Workbench
+from sparsestyle_ns.studies.curves import Curve, Values, decibels, observed_order
+from sparsestyle_ns.studies.study import with_setting
+from sparsestyle_ns.studies.time_budget import Budget, Case, Plan, in_turns
+from sparsestyle_ns.studies.workbench import Model, Workbench, setting_curve
 
 Colors = Float[Tensor, "rays 3"]
 Change = Callable[[], ContextManager[None]]
@@ -55,13 +54,17 @@ def difference(picture: Colors, reference: Colors) -> Dict[str, float]:
     return {"rmse": error, "psnr": decibels(error)}
 
 
+def timed_and_compared(
+    bench: Workbench, render: Callable[[RayBundle], Colors], rays: RayBundle, reference: Colors
+) -> Dict[str, float]:
+    """Seconds, scaled to a view, and difference of one render of some rays."""
+    seconds, picture = bench.timed(lambda: render(rays))
+    return {"view_seconds": seconds * math.prod(bench.size) / len(rays), **difference(picture, reference)}
+
+
 @torch.no_grad()
 def in_chunks(bundle: RayBundle, samples: int, budget: Budget, render: Callable[[RayBundle], Colors]) -> Colors:
-    """Renders rays a few at a time, so that memory is bounded and time can end in between.
-
-    Raises:
-        OutOfTimeError: it did.
-    """
+    """Renders rays a few at a time, so that memory is bounded and the budget can end in between."""
     rays = max(1, POINTS_PER_CALL // samples)
     parts: List[Tensor] = []
     for start in range(0, len(bundle), rays):
@@ -83,38 +86,27 @@ def altered(thing: object, **values: object) -> Iterator[None]:
             setattr(thing, name, value)
 
 
-# ------------------------------------------------------------------------------------------------------- quadrature
-
-
 def multiples(preset: int) -> Tuple[int, ...]:
     """The numbers of samples to measure, ascending."""
     return tuple(sorted({max(2, round(preset * factor)) for factor in FACTORS}))
 
 
-def with_preset(values: Sequence[float], preset: float) -> Tuple[float, ...]:
-    """Values and the preset's, ascending."""
-    near = any(math.isclose(value, preset) for value in values)
-    return tuple(sorted(values if near else (*values, preset)))
-
-
 def quadrature_plans(bench: Workbench) -> List[Plan]:
     """Samples a ray of the coarse field; and steps, skipping and stopping of stage 2's renders, measured together.
 
-    The last three are looked at in the coarse picture that comes with each stylised one, by the same samples, and share
-    a converged render: what the residual field says of empty cells, which training never visits, means nothing, and a
-    render that skips nothing would show it.
+    The last three are looked at in the coarse picture that comes with each stylised one: what the residual field says
+    of empty cells, which training never visits, means nothing, and a render that skips nothing would show it.
     """
 
-    def curve(name: str, title: str, place: str) -> Curve:
-        config = bench.coarse_config if name == "samples" else bench.style_config
-        preset, plots = str(get_setting(config, place)), [("view_seconds", "rmse")]
-        return Curve("quadrature", name, title, flag_of(place), preset, *plots[0], plots)
+    def curve(config: SparseStyleTrainerConfig, setting: str, name: str, title: str) -> Curve:
+        return setting_curve(config, f"pipeline.model.{setting}", "quadrature", name, title, [("view_seconds", "rmse")])
 
-    samples = curve("samples", "Samples a ray of the coarse field", "pipeline.model.num_eval_samples")
+    coarse, style = bench.coarse_config, bench.style_config
+    samples = curve(coarse, "num_eval_samples", "samples", "Samples a ray of the coarse field")
     marching = [
-        curve("steps", "Steps along a ray of the stylised field", "pipeline.model.num_steps"),
-        curve("skipping", "Opacity below which cells are skipped", "pipeline.model.min_alpha"),
-        curve("stopping", "Light left at which a ray ends", "pipeline.model.min_transmittance"),
+        curve(style, "num_steps", "steps", "Steps along a ray of the stylised field"),
+        curve(style, "min_alpha", "skipping", "Opacity below which cells are skipped"),
+        curve(style, "min_transmittance", "stopping", "Light left at which a ray ends"),
     ]
     return [
         Plan([samples], 3, lambda budget: _measure_samples(bench, samples, budget)),
@@ -123,21 +115,20 @@ def quadrature_plans(bench: Workbench) -> List[Plan]:
 
 
 def _measure_samples(bench: Workbench, curve: Curve, budget: Budget) -> None:
-    if bench.coarse_model is None:
-        raise OutOfTimeError
-    config = bench.coarse_model.eval().config
-    changes = _settings(config, "num_eval_samples", multiples(config.num_eval_samples))
-    _sweep(bench, bench.coarse_model, "num_eval_samples", {curve: changes}, contextlib.nullcontext, budget)
+    model = bench.coarse_to_render()
+    changes = _settings(model.config, "num_eval_samples", multiples(model.config.num_eval_samples))
+    _sweep(bench, model, "num_eval_samples", {curve: changes}, contextlib.nullcontext, budget)
 
 
 def _measure_marching(bench: Workbench, steps: Curve, skipping: Curve, stopping: Curve, budget: Budget) -> None:
     model = bench.model_to_render()
     config = model.config
-    grids = occupancies(model, with_preset(MIN_ALPHAS, float(skipping.preset)), budget)
+    grids = occupancies(model, sorted({*MIN_ALPHAS, config.min_alpha}), budget)
+    transmittances = sorted({*MIN_TRANSMITTANCES, config.min_transmittance})
     changes = {
         steps: _settings(config, "num_steps", multiples(config.num_steps)),
         skipping: {alpha: functools.partial(altered, model, occupancy=grid) for alpha, grid in grids.items()},
-        stopping: _settings(config, "min_transmittance", with_preset(MIN_TRANSMITTANCES, float(stopping.preset))),
+        stopping: _settings(config, "min_transmittance", transmittances),
     }
 
     @contextlib.contextmanager
@@ -161,12 +152,9 @@ def _sweep(
     nothing_skipped: Change,
     budget: Budget,
 ) -> None:
-    """Renders some rays of held-out views in different ways, and compares with a converged render.
+    """Renders some rays of held-out views in different ways, and compares with a converged render, `nothing_skipped`.
 
-    Args:
-        samples: name of the setting that says how many samples a ray has.
-        changes: of each curve the values, and what gives the model this value.
-        nothing_skipped: keeps the model from leaving out samples, for the converged render.
+    The first curve's setting is `samples`; `changes` has of each curve the values, and what gives the model this value.
     """
     output = "rgb" if model is bench.coarse_model else "rgb_coarse"
     preset = getattr(model.config, samples)
@@ -194,43 +182,33 @@ def _sweep(
     def case(curve: Curve, value: float, change: Change) -> Case:
         def measure(_round: int) -> Mapping[str, Values]:
             with change():
-                seconds, picture = bench.timed(lambda: render(rays))
-            return {"": {"view_seconds": seconds * bench.pixels / len(rays), **difference(picture, reference)}}
+                return {"": timed_and_compared(bench, render, rays, reference)}
 
         return Case([(curve, value)], measure)
 
     cases = [case(curve, *change) for curve, ways in changes.items() for change in ways.items()]
     in_turns(cases, budget, bench.rounds, bench.watch)
-    by_number, *_ = changes
-    numbers = [int(point.setting) for point in by_number.points]
-    by_number.order = observed_order(numbers, [point.median("rmse") for point in by_number.points])
+    first, *_ = changes
+    errors = [point.median("rmse") for point in first.points]
+    first.order = observed_order([int(point.setting) for point in first.points], errors)
 
 
+@torch.no_grad()
 def occupancies(model: HierStyleModel, thresholds: Sequence[float], budget: Budget) -> Dict[float, Occupancy]:
-    """The occupied cells for several thresholds; the field is evaluated once for all of them.
-
-    Raises:
-        OutOfTimeError: the time was over before it was evaluated everywhere.
-    """
+    """The occupied cells for several thresholds; the field is evaluated once for all of them, if there is time."""
     densities: List[Tensor] = []
+
+    def evaluate(points: Tensor) -> Tensor:
+        budget.check()
+        with autocast(model.device, model.config.precision):
+            densities.append(model.field.density_and_feature(points)[0])
+        return densities[-1]
+
     grids = {threshold: Occupancy(model.config.occupancy_resolution).to(model.device) for threshold in thresholds}
     for threshold, grid in grids.items():
-        calls = itertools.count()
-
-        def density(points: Tensor, calls: Iterator[int] = calls) -> Tensor:
-            number = next(calls)
-            if number == len(densities):
-                budget.check()
-                with autocast(model.device, model.config.precision):
-                    densities.append(model.field.density_and_feature(points)[0])
-            return densities[number]
-
-        with torch.no_grad():
-            grid.measure(density, threshold, POINTS_PER_CALL)
+        known = iter(densities) if densities else None
+        grid.measure(evaluate if known is None else lambda _, known=known: next(known), threshold, POINTS_PER_CALL)
     return grids
-
-
-# ------------------------------------------------------------------------------------------------ exact and baked
 
 
 def baking_plan(bench: Workbench) -> Plan:
@@ -241,7 +219,7 @@ def baking_plan(bench: Workbench) -> Plan:
 
 
 def _measure_baking(bench: Workbench, curve: Curve, budget: Budget) -> None:
-    model = bench.model_to_render()
+    model, flight = bench.model_to_render(), _flight(bench)
     height, width = bench.size
     what = "the stylised scene" if bench.is_stylised else "the coarse field (there is no painting)"
     curve.own_error = bench.own_error
@@ -250,88 +228,75 @@ def _measure_baking(bench: Workbench, curve: Curve, budget: Budget) -> None:
         "PSNR is against the exact picture. A baked volume's first picture takes longer: it fills the voxels "
         "(render_mode: baked)."
     )
-    own, flight, volumes = model.config.bake_resolution, _flight(bench), {}
+    volumes: Dict[int, BakedVolume] = {}
     exact: Dict[int, Colors] = {}
 
-    def draw(frame: int, resolution: Optional[int]) -> Tuple[float, Colors]:
+    def draw(frame: int, volume: Optional[BakedVolume]) -> Tuple[float, Colors]:
         def render(rays: RayBundle) -> Colors:
-            if resolution is None:
-                return bench.picture(model.get_outputs(rays))
+            if volume is None:
+                return model.get_outputs(rays)["rgb" if bench.is_stylised else "rgb_coarse"]
             segments = model.space.segments(rays.origins, rays.directions)
-            fine, coarse = render_baked(volumes[resolution], segments, model.marching, model.background)
+            fine, coarse = render_baked(volume, segments, model.marching, model.background)
             return fine.rgb if bench.is_stylised else coarse.rgb
 
         at = frame % len(flight)
         rays = flight[at : at + 1].generate_rays(camera_indices=0, keep_shape=False).flatten()
         return bench.timed(lambda: in_chunks(rays, model.config.num_steps, budget, render))
 
-    def case(resolution: Optional[int]) -> Case:
-        def measure(round_: int) -> Mapping[str, Values]:
-            first: Dict[str, float] = {}
-            if resolution is None and not exact:
-                draw(0, None)  # the first takes longer
-            elif resolution is not None and resolution not in volumes:
-                volumes[resolution] = model.bake(resolution)
-                first["first_seconds"], _ = draw(0, resolution)
-            # A frame that another case has no exact picture of is compared with the latest that there is one of.
-            frame = round_ + 1 if resolution is None else min(round_ + 1, max(exact))
-            seconds, picture = draw(frame, resolution)
-            if resolution is None:
-                exact[frame] = picture
-            else:
-                first["memory_mb"] = volumes[resolution].num_bytes / 1e6
-            return {"": {**first, "view_seconds": seconds, "fps": 1 / seconds, **difference(picture, exact[frame])}}
+    def measure_exact(round_: int) -> Mapping[str, Values]:
+        if not exact:
+            draw(0, None)  # the first takes longer
+        seconds, exact[round_ + 1] = draw(round_ + 1, None)
+        return {"": {"view_seconds": seconds, "fps": 1 / seconds, "rmse": 0.0, "psnr": math.inf}}
 
-        return Case([(curve, resolution or curve.preset)], measure)
+    def measure_baked(resolution: int, round_: int) -> Mapping[str, Values]:
+        found: Dict[str, float] = {}
+        if resolution not in volumes:
+            volumes[resolution] = model.bake(resolution)
+            found["first_seconds"], _ = draw(0, volumes[resolution])
+        # A frame that there is no exact picture of is replaced by the latest that there is one of.
+        frame = min(round_ + 1, max(exact))
+        seconds, picture = draw(frame, volumes[resolution])
+        found |= {"memory_mb": volumes[resolution].num_bytes / 1e6, "view_seconds": seconds, "fps": 1 / seconds}
+        return {"": {**found, **difference(picture, exact[frame])}}
 
-    resolutions = [None, *RESOLUTIONS, *([own] if own not in RESOLUTIONS else [])]
-    in_turns([case(resolution) for resolution in resolutions], budget, bench.rounds, bench.watch)
+    cases = [Case([(curve, curve.preset)], measure_exact)]
+    for resolution in dict.fromkeys((*RESOLUTIONS, model.config.bake_resolution)):
+        cases.append(Case([(curve, resolution)], functools.partial(measure_baked, resolution)))
+    in_turns(cases, budget, bench.rounds, bench.watch)
 
 
 def _flight(bench: Workbench) -> Cameras:
     """A camera that flies from one view to the next."""
-    cameras = bench.eval_dataset.cameras
-    if len(cameras) < 2:
-        cameras = bench.manager.train_dataset.cameras
-    path = cameras[:1]
+    cameras = bench.eval_dataset.cameras if len(bench.eval_dataset) > 1 else bench.manager.train_dataset.cameras
     if len(cameras) > 1:
-        path = get_interpolated_camera_path(cameras[:2], FRAMES_BETWEEN_VIEWS, order_poses=False)
-    return path.to(bench.device)
-
-
-# ---------------------------------------------------------------------------------------------------- number formats
+        cameras = get_interpolated_camera_path(cameras[:2], FRAMES_BETWEEN_VIEWS, order_poses=False)
+    return cameras.to(bench.device)
 
 
 def precision_plan(bench: Workbench) -> Plan:
     """Number formats of matrix products, those that the device has."""
-    preset = bench.coarse_config.pipeline.model.precision
-    if preset == "auto":
-        preset = "bfloat16" if multiplies_bfloat16(bench.device) else "float32"
     title, plots = "Number format of matrix products", [("view_seconds", "rmse"), ("step_seconds", "rmse")]
-    curve = Curve("precision", "precision", title, flag_of(PRECISION), preset, *plots[0], plots)
+    curve = setting_curve(bench.coarse_config, PRECISION, "precision", "precision", title, plots)
+    if curve.preset == "auto":
+        curve.preset = "bfloat16" if multiplies_bfloat16(bench.device) else "float32"
     return Plan([curve], 3, lambda budget: _measure_precision(bench, curve, budget))
 
 
 def _measure_precision(bench: Workbench, curve: Curve, budget: Budget) -> None:
-    model = bench.coarse_model
-    if model is None:
-        raise OutOfTimeError
-    model.eval()
-    has: Dict[Precision, bool] = {
-        "float32": True,
-        "tf32": multiplies_tf32(bench.device),
-        "bfloat16": multiplies_bfloat16(bench.device),
-    }
+    model, device = bench.coarse_to_render(), bench.device
+    has: Dict[Precision, bool] = {"float32": True}
+    has |= {"tf32": multiplies_tf32(device), "bfloat16": multiplies_bfloat16(device)}
     curve.left_out += [f"{name}: the device has no instructions for it" for name, there in has.items() if not there]
     curve.own_error = bench.own_error
-    bundle, samples = bench.some_rays(FORMAT_RAYS), model.config.num_eval_samples
+    rays, samples = bench.some_rays(FORMAT_RAYS), model.config.num_eval_samples
     curve.note = (
-        f"{len(bundle)} random rays of held-out views of the coarse field, against the same samples in float64; and "
+        f"{len(rays)} random rays of held-out views of the coarse field, against the same samples in float64; and "
         "iterations of stage 1."
     )
-    reference = in_chunks(bundle, samples, budget, lambda part: in_float64(model, part))
+    reference = in_chunks(rays, samples, budget, lambda part: in_float64(model, part))
 
-    def render() -> Colors:
+    def render(bundle: RayBundle) -> Colors:
         return in_chunks(bundle, samples, budget, lambda part: model.get_outputs(part)["rgb"])
 
     def case(precision: Precision) -> Case:
@@ -340,11 +305,9 @@ def _measure_precision(bench: Workbench, curve: Curve, budget: Budget) -> None:
 
         def measure(_round: int) -> Mapping[str, Values]:
             with altered(model.config, precision=precision):
-                seconds, picture = bench.timed(render)
+                found = timed_and_compared(bench, render, rays, reference)
             budget.check()
-            steps = [bench.timed(training.step)[0] for _ in range(3)]
-            seconds *= bench.pixels / len(bundle)
-            return {"": {"view_seconds": seconds, "step_seconds": steps, **difference(picture, reference)}}
+            return {"": {**found, "step_seconds": [bench.timed(training.step)[0] for _ in range(3)]}}
 
         return Case([(curve, precision)], measure)
 
@@ -353,11 +316,10 @@ def _measure_precision(bench: Workbench, curve: Curve, budget: Budget) -> None:
 
 def in_float64(model: CoarseFewShotModel, bundle: RayBundle) -> Colors:
     """Colours of rays with the same samples, computed in float64."""
-    field = copy.deepcopy(model.field).double()
-    edges = model.place_samples(
-        model.space.segments(bundle.origins, bundle.directions), model.config.num_eval_samples, None
-    )
+    in_float32 = model.space.segments(bundle.origins, bundle.directions)
+    edges = model.place_samples(in_float32, model.config.num_eval_samples, None).double()
     background = None if model.background is None else model.background.double()
-    origins, directions = bundle.origins.double(), bundle.directions.double()
-    segments = model.space.segments(origins, directions)
-    return render_coarse(field, segments, directions, edges.double(), model.space.unbounded, background).rgb
+    directions = bundle.directions.double()
+    segments = model.space.segments(bundle.origins.double(), directions)
+    field = copy.deepcopy(model.field).double()
+    return render_coarse(field, segments, directions, edges, model.space.unbounded, background).rgb

@@ -1,20 +1,24 @@
 """Runs of both stages: what held-out views are like, against the time of training, of an iteration, and memory."""
 
+import gc
 import math
-from typing import Dict, List, NamedTuple, Sequence, Tuple
+import statistics
+from typing import Callable, Dict, List, NamedTuple, Sequence, Tuple
 
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.studies.curves import Curve, Values
-from sparsestyle_ns.studies.study import flag_of, get_setting, with_setting
+from sparsestyle_ns.studies.study import get_setting, with_setting
 from sparsestyle_ns.studies.study_options import Group
 from sparsestyle_ns.studies.time_budget import Budget, Case, OutOfTimeError, Plan, in_turns
-from sparsestyle_ns.studies.workbench import Workbench, squeezed
+from sparsestyle_ns.studies.workbench import Workbench, setting_curve, squeezed
 from sparsestyle_ns.utils.machine import PeakMemory
 
 LONG_STOPS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1)
 SHORT_STOPS = (1 / 4, 1 / 2, 1)
 """Shares of a run at which it is evaluated."""
 MIN_ITERATIONS = 3
+PROBE_STEPS = 3
+"""Iterations from which the time of one is estimated, after one that doesn't count."""
 EVALUATION_SHARE = 0.3
 """Part of a run's time that evaluating it may take; how often, and on how many views, follows from it."""
 WARM_START_SHARE = 0.8
@@ -27,30 +31,23 @@ class Knob(NamedTuple):
     name: str
     title: str
     place: str
-    factors: Tuple[float, ...] = ()
-    steps: Tuple[int, ...] = ()
-    values: Tuple[int, ...] = ()
-
-    def around(self, preset: int) -> Tuple[int, ...]:
-        """The values to measure: multiples of the preset's, steps from it, and values of their own."""
-        near = (*(int(preset * factor) for factor in self.factors), *(preset + step for step in self.steps))
-        return tuple(value for value in (*near, *self.values) if value >= 1)
+    around: Callable[[int], Tuple[int, ...]]
 
 
 KNOBS: Dict[Group, Tuple[Knob, ...]] = {
     "training": (
-        Knob("width", "Width of the coarse field", "pipeline.model.coarse_field.layer_width", (1 / 2, 1 / 4)),
-        Knob("levels", "Octaves of the encoding", "pipeline.model.coarse_field.num_levels", steps=(-2, 2)),
-        Knob("batch", "Rays a batch", "pipeline.datamanager.train_num_rays_per_batch", (1 / 4, 4)),
+        Knob("width", "Width of the field", "pipeline.model.coarse_field.layer_width", lambda n: (n // 2, n // 4)),
+        Knob("levels", "Octaves of the encoding", "pipeline.model.coarse_field.num_levels", lambda n: (n - 2, n + 2)),
+        Knob("batch", "Rays a batch", "pipeline.datamanager.train_num_rays_per_batch", lambda n: (n // 4, 4 * n)),
     ),
     "fine-field": (
-        Knob("hash levels", "Levels of the hash grid", "pipeline.model.hash_levels", (1 / 2, 2)),
-        Knob("resolution", "Finest level's cells", "pipeline.model.max_resolution", (1 / 2, 2)),
-        Knob("table", "Length of a level's table (log2)", "pipeline.model.log2_table_size", steps=(-2, -4)),
+        Knob("hash levels", "Levels of the hash grid", "pipeline.model.hash_levels", lambda n: (n // 2, 2 * n)),
+        Knob("resolution", "Finest level's cells", "pipeline.model.max_resolution", lambda n: (n // 2, 2 * n)),
+        Knob("table", "Length of a level's table (log2)", "pipeline.model.log2_table_size", lambda n: (n - 2, n - 4)),
     ),
     "style": (
-        Knob("feature size", "Size that the feature network sees", "pipeline.feature_side", (1 / 2, 2)),
-        Knob("style features", "Style features that count", "pipeline.style_features", values=(1024, 128)),
+        Knob("feature size", "Size that the feature network sees", "pipeline.feature_side", lambda n: (n // 2, 2 * n)),
+        Knob("style features", "Style features that count", "pipeline.style_features", lambda n: (1024, 128)),
     ),
 }
 
@@ -88,12 +85,11 @@ class StageRuns:
         return Plan(list(curves.values()), weight, lambda budget: self._short(curves, budget))
 
     def _curve(self, group: Group, name: str, title: str, place: str) -> Curve:
-        time, plots = "train_seconds", [("train_seconds", metric) for metric in self.metrics]
+        time = "step_seconds" if group == "fine-field" else "train_seconds"
+        plots = [(time, metric) for metric in self.metrics]
         if group == "fine-field":
-            time = "step_seconds"
-            plots = [*((time, metric) for metric in self.metrics), ("memory_mb", self.metrics[0])]
-        preset = str(get_setting(self.preset, place))
-        return Curve(group, name, title, flag_of(place), preset, time, self.metrics[0], plots)
+            plots.append(("memory_mb", self.metrics[0]))
+        return setting_curve(self.preset, place, group, name, title, plots)
 
     def _config(self) -> SparseStyleTrainerConfig:
         return self.bench.adapted_style_config() if self.is_style else self.preset
@@ -101,8 +97,7 @@ class StageRuns:
     def _fitting(self, config: SparseStyleTrainerConfig, budget: Budget, shares: Sequence[float]) -> RunPlan:
         """A run that fits into the budget; a few iterations, and a view, are tried to find out.
 
-        Args:
-            shares: of the run, at which it is evaluated where there is time for all of them.
+        It is evaluated at `shares` of it, where there is time for all of them.
         """
         bench = self.bench
         budget.check()
@@ -112,7 +107,8 @@ class StageRuns:
                 bench.start(config, budget)  # freezes the views, once for all runs
                 budget.check()
         setup, probe = bench.timed(lambda: bench.start(config, budget))
-        step, model = bench.step_seconds(probe, budget), probe.pipeline.model
+        steps, model = bench.train(probe, 1 + PROBE_STEPS, budget), probe.pipeline.model
+        budget.check()
         if type(model) not in bench.view_seconds:
             bench.evaluate(model, bench.views[:1])
         seconds = max(bench.view_seconds[type(model)], 1e-9)
@@ -120,8 +116,8 @@ class StageRuns:
         shares = shares[-max(1, int(EVALUATION_SHARE * budget.left / seconds)) :]
         views = bench.views[: max(1, int(EVALUATION_SHARE * budget.left / (len(shares) * seconds)))]
         left = budget.left - setup - len(shares) * len(views) * seconds
-        fitting = max(MIN_ITERATIONS, int((WARM_START_SHARE if self.is_style else 1.0) * left / step))
-        iterations = min(config.max_num_iterations, fitting)
+        fitting = int((WARM_START_SHARE if self.is_style else 1.0) * left / statistics.mean(steps[1:]))
+        iterations = min(config.max_num_iterations, max(MIN_ITERATIONS, fitting))
         return RunPlan(iterations, sorted({math.ceil(iterations * share) for share in shares}), views)
 
     def _long(self, curve: Curve, budget: Budget) -> None:
@@ -135,10 +131,10 @@ class StageRuns:
         training = bench.start(squeezed(config, plan.iterations), budget)
         model, seconds = training.pipeline.model, 0.0
         if self.is_style:
-            bench.keep_style(model)
+            bench.style_model, bench.is_stylised = model, True
         for stop in plan.stops:
             with bench.watch:
-                seconds += sum(bench.train(training, stop, budget, bench.seconds_to_evaluate(model, plan.views)))
+                seconds += sum(bench.train(training, stop, budget, plan.views))
             if not self.is_style and bench.trains_coarse:
                 bench.keep_coarse(model)
             values = {"train_seconds": seconds, **bench.evaluate(model, plan.views)}
@@ -149,7 +145,7 @@ class StageRuns:
     def _short(self, curves: Dict[Knob, Curve], budget: Budget) -> None:
         bench, config = self.bench, self._config()
         presets = {knob: get_setting(config, knob.place) for knob in curves}
-        values = {knob: knob.around(preset) for knob, preset in presets.items()}
+        values = {knob: [n for n in knob.around(preset) if n >= 1] for knob, preset in presets.items()}
         share = budget.left / (1.5 + sum(map(len, values.values())))
         plan = self._fitting(config, budget.part(share), SHORT_STOPS[1:] if self.is_style else SHORT_STOPS)
         what = f"{plan.iterations} iterations" if self.is_style else f"{share:.3g} s with its evaluations"
@@ -172,12 +168,11 @@ class StageRuns:
     ) -> Dict[str, Values]:
         """What was found at the stops of one run, and as that of no moment, of its iterations.
 
-        Raises:
-            OutOfTimeError: it was stopped before its end in stage 2: fewer iterations than the others have can't be set
-                beside them.
+        A run of stage 2 that is out of time before its end gives nothing: the others have more iterations.
         """
         bench = self.bench
-        bench.collect_garbage()  # what is left of the run before would count as this one's memory
+        gc.collect()  # what is left of the run before would count as this one's memory
+        gc.freeze()  # what is there before a run needn't be searched again, which takes most time
         if not self.is_style:
             budget = budget.part(seconds)
             iterations = self._fitting(config, budget, SHORT_STOPS).iterations
@@ -187,7 +182,7 @@ class StageRuns:
         model, steps, memory, found = training.pipeline.model, [], 0, {}
         for number, stop in enumerate(plan.stops, 1):
             with PeakMemory(bench.device) as peak:
-                steps += bench.train(training, stop, budget, bench.seconds_to_evaluate(model, plan.views))
+                steps += bench.train(training, stop, budget, plan.views)
             if self.is_style and training.num_steps < stop:
                 raise OutOfTimeError
             memory, values = max(memory, peak.bytes), bench.evaluate(model, plan.views)

@@ -2,14 +2,11 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Dict, Mapping, Optional, Tuple
+from typing import Dict, Optional, Tuple
 
-from sparsestyle_ns.studies.run_queue import Run, as_pairs
+from sparsestyle_ns.studies.run_queue import Run, Settings
 from sparsestyle_ns.studies.study import Stage, Study
 from sparsestyle_ns.style.backbones import available_backbone
-
-Settings = Mapping[str, object]
-"""Values by their place in a method's config."""
 
 HIGH_FREQUENCIES: Settings = {"pipeline.model.coarse_field.num_levels": 10, "pipeline.model.distortion_weight": 0.0}
 VANILLA: Settings = {**HIGH_FREQUENCIES, "pipeline.model.coarse_field.num_layers": 8}
@@ -18,11 +15,7 @@ COARSE_KINDS: Dict[str, Settings] = {
     "paper": {"pipeline.model.distortion_weight": 0.0},
     "vanilla": VANILLA,
     "dietnerf": {**VANILLA, "pipeline.semantic_weight": 0.1},
-    "freenerf": {
-        **HIGH_FREQUENCIES,
-        "pipeline.model.frequency_reveal": 0.9,
-        "pipeline.model.occlusion_weight": 0.01,
-    },
+    "freenerf": {**HIGH_FREQUENCIES, "pipeline.model.frequency_reveal": 0.9, "pipeline.model.occlusion_weight": 0.01},
 }
 """Stage 1: as it is; as the paper writes it, on colours alone; NeRF's ten octaves, eight layers, view dependence; the
 same with a semantic loss of DietNeRF's kind; and ten octaves with FreeNeRF's regularisers."""
@@ -57,17 +50,12 @@ PICTURES = (20, 100)
 
 @dataclass
 class PaperRuns:
-    """The runs on one scene.
-
-    Attributes:
-        study: the scene.
-        output_dir: where the runs are.
-        found_backbone: the feature network of all runs, unless the study's flags name weights; None: there is none.
-    """
+    """The runs on one scene."""
 
     study: Study
     output_dir: Path
     found_backbone: Optional[str] = field(default_factory=available_backbone)
+    """The feature network of all runs, unless the study's flags name weights; None: there is none."""
 
     def __post_init__(self) -> None:
         stages: Tuple[Stage, Stage] = ("coarse-fewshot", "hier-style")
@@ -88,19 +76,20 @@ class PaperRuns:
     def coarse(self, kind: str) -> Run:
         """The run of stage 1 of a kind."""
         network = self._network("coarse-fewshot") if kind == "dietnerf" else {}
-        settings = as_pairs(COARSE_KINDS[kind], {} if kind == "ours" else COLORS_ALONE, network)
-        return Run(self.study, self.output_dir, kind, "coarse-fewshot", settings)
+        settings = {**COARSE_KINDS[kind], **({} if kind == "ours" else COLORS_ALONE), **network}
+        return Run(self.study, self.output_dir, kind, "coarse-fewshot", tuple(settings.items()))
 
     def stylised(self, painting: Path, style_kind: str = "ours", coarse_kind: str = "ours") -> Run:
         """The run of stage 2 of a kind, on a coarse field of a kind."""
         iterations = self.study.iterations("hier-style")
         colors = {} if coarse_kind == "ours" else COLORS_ALONE
+        settings = {**STYLE_KINDS[style_kind], **colors, **EVERY_LOSS, **self._network("hier-style")}
         return Run(
             self.study,
             self.output_dir,
             name=f"{coarse_kind}-{style_kind}-{painting.stem}",
             stage="hier-style",
-            settings=as_pairs(STYLE_KINDS[style_kind], colors, EVERY_LOSS, self._network("hier-style")),
+            settings=tuple(settings.items()),
             painting=painting,
             coarse=self.coarse(coarse_kind),
             pictures=(*(count for count in PICTURES if count < iterations), iterations),

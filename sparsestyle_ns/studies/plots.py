@@ -1,8 +1,9 @@
 """Plots of losses in training, and of curves of error against time."""
 
+import contextlib
 import io
 import math
-from typing import List, Mapping, Sequence, Tuple
+from typing import Iterator, List, Mapping, Sequence, Tuple
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -10,7 +11,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from sparsestyle_ns.studies.curves import METRICS, Curve, Point
+from sparsestyle_ns.studies.curves import METRICS, ON_LINEAR_SCALES, Curve, Point
 
 COLORS = ("#33617f", "#b4492b", "#6a8f3c", "#8a5a9e", "#b58a2a", "#3f8f8a")
 CHOSEN, FRONT, GRID = "#b4492b", "#9aa5ab", {"color": "#e4e1da", "lw": 0.6}
@@ -32,31 +33,21 @@ COLUMNS = 3
 def line_plot(
     series: Mapping[str, Tuple[Sequence[float], Sequence[float]]], x_label: str, y_label: str, marks: bool = False
 ) -> str:
-    """Lines with a legend as SVG.
-
-    Args:
-        series: x and y values of each line, by name.
-        x_label: below the axis.
-        y_label: beside it.
-        marks: whether the end of each line is marked with a dot.
-    """
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=SIZE, layout="constrained")
-        cell = figure.subplots()
+    """Lines with a legend as SVG: x and y values of each by its name; `marks` puts a dot at their ends."""
+    with _svg() as (cell, svg):
         for name, (x, y) in series.items():
             cell.plot(x, y, label=name, linewidth=1.5, marker="o" if marks else "", markevery=[-1])
         cell.set(xlabel=x_label, ylabel=y_label)
         cell.legend()
         cell.grid(True, **GRID)
-        return _as_svg(figure)
+    return svg.getvalue()
 
 
 def curve_plot(curve: Curve, x: str, y: str) -> str:
     """Two metrics of a curve as SVG."""
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=SIZE, layout="constrained")
-        _draw(figure.subplots(), curve, x, y)
-        return _as_svg(figure)
+    with _svg() as (cell, svg):
+        _draw(cell, curve, x, y)
+    return svg.getvalue()
 
 
 def overview(curves: Sequence[Curve]) -> bytes:
@@ -75,17 +66,19 @@ def overview(curves: Sequence[Curve]) -> bytes:
     return buffer.getvalue()
 
 
-def _as_svg(figure: Figure) -> str:
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
+@contextlib.contextmanager
+def _svg() -> Iterator[Tuple[Axes, io.StringIO]]:
+    """A plot to draw into, and what it is written to in the end."""
+    with matplotlib.rc_context(STYLE):
+        figure, svg = Figure(figsize=SIZE, layout="constrained"), io.StringIO()
+        yield figure.subplots(), svg
+        figure.savefig(svg, format="svg", metadata={"Date": None})
 
 
 def _draw(cell: Axes, curve: Curve, x: str, y: str) -> None:
-    """Points with the spread of their repetitions, the front, and a ring around the recommended one.
+    """Points with the spread of their repetitions (hollow: busy machine), the front, a ring around the recommended one.
 
-    Hollow points were measured while the machine was busy. Where a number is infinite, a triangle at the top stands for
-    it.
+    A triangle at the top stands for an infinite number.
     """
     points = [point for point in curve.points if x in point.values and y in point.values]
     finite = [point.median(y) for point in points if math.isfinite(point.median(y))] or [0.0, 1.0]
@@ -116,9 +109,9 @@ def _draw(cell: Axes, curve: Curve, x: str, y: str) -> None:
         cell.plot(*places(front), "--", color=FRONT, lw=1, zorder=1)
     if curve.recommended in points:
         cell.plot(*places([curve.recommended]), "o", ms=13, mfc="none", mec=CHOSEN, mew=1.8, zorder=4)
-    cell.set(xlabel=METRICS[x].label, ylabel=METRICS[y].label)
+    cell.set(xlabel=METRICS[x], ylabel=METRICS[y])
     for metric, scale in ((x, cell.xaxis), (y, cell.yaxis)):
-        if METRICS[metric].log and all(point.median(metric) > 0 for point in points):
+        if metric not in ON_LINEAR_SCALES and all(point.median(metric) > 0 for point in points):
             _make_logarithmic(scale)
     cell.grid(True, which="major", **GRID)
     cell.margins(0.12)

@@ -1,10 +1,11 @@
 """What is measured of a run. Everything is kept beside it, so that a table is made again without rendering again."""
 
+import functools
 import json
 import shutil
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Callable, Dict, List, Mapping, Optional, Tuple
+from typing import Callable, Dict, List, Optional, Sequence, Tuple
 
 import torch
 from jaxtyping import Float
@@ -24,12 +25,11 @@ from sparsestyle_ns.runs.run_folder import REPORT_FILE
 from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.progress import track
 
-OWN_FRAMES = ""
-"""Names the frames that a run itself renders."""
+FIGURES_FILE = "figures.json"
 STYLE_EVERY = 4
 """Style and content are measured on every fourth frame of the path: neighbours say the same."""
 
-Stylise = Callable[[PathFrames], List[Float[Tensor, "H W 3"]]]
+Stylise = Callable[[PathFrames], Sequence[Float[Tensor, "H W 3"]]]
 """Makes stylised frames of a path's unstylised ones."""
 Trace = Tuple[List[int], List[float]]
 """Iterations, and the values of a loss there."""
@@ -37,17 +37,14 @@ Trace = Tuple[List[int], List[float]]
 
 @dataclass
 class RunFigures:
-    """What a row of a table shows.
-
-    Attributes:
-        figures: as `PathFrames.figures` and `stylisation_figures` name them, and `unstylised_ssim`.
-        pictures: PNG files of the path's first, middle and last frame.
-        coarse_pictures: the same, unstylised.
-    """
+    """What a row of a table shows."""
 
     figures: Dict[str, float]
+    """As `PathFrames.figures` and `stylisation_figures` name them, and `unstylised_ssim`."""
     pictures: List[Path]
+    """PNG files of the path's first, middle and last frame."""
     coarse_pictures: List[Path] = field(default_factory=list)
+    """The same, unstylised."""
 
 
 class PaintingMeasure:
@@ -56,24 +53,17 @@ class PaintingMeasure:
     def __init__(self, painting: Path) -> None:
         self.painting = painting
         self._targets: Optional[StyleTargets] = None
-        self._gram: Optional[Tensor] = None
 
     def figures(self, frames: PathFrames, settings: HierStylePipelineConfig) -> Dict[str, float]:
-        """Style strength and content kept, means over every `STYLE_EVERY`th frame, and ArtFID of all of these.
-
-        Args:
-            frames: the frames.
-            settings: the pipeline's config of a run; it names network and sizes.
-        """
+        """Means over some frames of style strength and content kept, and their ArtFID; by a run's network and sizes."""
         if self._targets is None:
             settings = replace(settings, style_image=self.painting)
             self._targets = settings.targets_of(*settings.load_style(), torch.device("cpu"))
-            self._gram = gram_matrix(self._targets.style_rows())
-        values, art_fid = [], ArtFID.against(self._targets.style_image)
+        values, art_fid, gram = [], ArtFID.against(self._targets.style_image), gram_matrix(self._targets.style_rows())
         for index in track(range(0, len(frames.stylised), STYLE_EVERY), "Style and content"):
             stylised, coarse = frames.stylised[index], frames.coarse[index]
             covered = frames.surfaces[index].covered.float()
-            figures = stylisation_figures(self._targets, self._gram, coarse, stylised, covered)
+            figures = stylisation_figures(self._targets, gram, coarse, stylised, covered)
             values.append({**figures, "unstylised_ssim": image_metrics(stylised, coarse)["ssim"]})
             if art_fid is not None:
                 art_fid.add(stylised, coarse)
@@ -81,72 +71,59 @@ class PaintingMeasure:
         return means | ({} if art_fid is None else art_fid.figures())
 
 
-def measure_run(folder: Path, painting: PaintingMeasure) -> RunFigures:
-    """What is measured of a stylised run, on the measuring path."""
-    return measure_frames(folder, painting, {OWN_FRAMES: lambda frames: frames.stylised})[OWN_FRAMES]
+def measure_run(
+    folder: Path, painting: PaintingMeasure, way: str = "", stylise: Optional[Stylise] = None
+) -> RunFigures:
+    """What is measured of a stylised run on the measuring path; known figures are read again.
 
-
-def measure_frames(
-    folder: Path, painting: PaintingMeasure, stylised_by: Mapping[str, Stylise]
-) -> Dict[str, RunFigures]:
-    """What is measured of frames that are stylised in several ways, by the ways' names; known figures are read again.
-
-    Args:
-        folder: of the run whose unstylised frames and geometry all are compared with.
-        painting: the painting.
-        stylised_by: what makes the frames.
+    With the name of a way, and `stylise` for it, of frames stylised so in place of the run's own.
     """
-    checkpoint = newest_checkpoint(folder / "nerfstudio_models")
-    assert checkpoint is not None, folder
-    step = checkpoint_step(checkpoint)
-    targets = {name: folder / ("measured" + (f"-{name}" if name else "")) for name in stylised_by}
-    missing = [name for name, target in targets.items() if read_figures(target, step) is None]
-    if missing:
-        config, pipeline, _ = load_run(folder / "config.yml")
-        frames = render_path(pipeline.model, measuring_path(pipeline.datamanager.train_dataset.cameras))
-        for name in missing:
-            changed = replace(frames, stylised=stylised_by[name](frames))
-            figures = {**changed.figures(), **painting.figures(changed, config.pipeline)}
-            _save_figures(targets[name], step, changed, figures)
-    found = {name: read_figures(target, step) for name, target in targets.items()}
-    return {name: figures for name, figures in found.items() if figures is not None}
-
-
-def _save_figures(folder: Path, step: int, frames: PathFrames, figures: Mapping[str, float]) -> None:
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
+    step = checkpoint_step(newest_checkpoint(folder / "nerfstudio_models"))
+    target = folder / (f"measured-{way}" if way else "measured")
+    known = read_figures(target, step)
+    if known is not None:
+        return known
+    settings, frames = _render(folder, step)
+    if stylise is not None:
+        frames = replace(frames, stylised=stylise(frames))
+    figures = {**frames.figures(), **painting.figures(frames, settings)}
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir()
     for place, index in enumerate((0, len(frames.stylised) // 2, len(frames.stylised) - 1)):
-        save_picture(frames.stylised[index], folder / f"stylised-{place}.png")
-        save_picture(frames.coarse[index], folder / f"coarse-{place}.png")
+        for name, pictures in (("stylised", frames.stylised), ("coarse", frames.coarse)):
+            save_image(pictures[index].detach().cpu().permute(2, 0, 1), target / f"{name}-{place}.png")
     # Last, so that a folder with figures is a whole one.
-    write_whole(folder / "figures.json", json.dumps({"step": step, "figures": figures}, indent=1) + "\n")
+    write_whole(target / FIGURES_FILE, json.dumps({"step": step, "figures": figures}, indent=1) + "\n")
+    return RunFigures(figures, *_pictures(target))
+
+
+@functools.lru_cache(maxsize=1)
+def _render(folder: Path, _step: int) -> Tuple[HierStylePipelineConfig, PathFrames]:
+    config, pipeline, _ = load_run(folder / "config.yml")
+    return config.pipeline, render_path(pipeline.model, measuring_path(pipeline.datamanager.train_dataset.cameras))
+
+
+def _pictures(folder: Path) -> List[List[Path]]:
+    return [sorted(folder.glob(f"{name}-*.png")) for name in ("stylised", "coarse")]
 
 
 def read_figures(folder: Path, step: int) -> Optional[RunFigures]:
     """What was measured, if it is of that iteration and nothing can be measured by now that couldn't be then."""
     try:
-        content = json.loads((folder / "figures.json").read_text())
+        content = json.loads((folder / FIGURES_FILE).read_text())
     except (OSError, ValueError):  # there is none, or it was cut short
         return None
     figures = content["figures"]
     has_all = ("art_fid" in figures or missing_weights()) and ("short_lpips" in figures or not has_lpips())
-    if content["step"] != step or not has_all:
-        return None
-    return RunFigures(figures, *(sorted(folder.glob(f"{name}-*.png")) for name in ("stylised", "coarse")))
+    return RunFigures(figures, *_pictures(folder)) if content["step"] == step and has_all else None
 
 
 def measure_coarse(folder: Path) -> Dict[str, float]:
     """A coarse run's figures on its held-out views, kept beside it."""
-    checkpoint = newest_checkpoint(folder / "nerfstudio_models")
-    known = None if checkpoint is None else saved_report(folder, checkpoint_step(checkpoint))
+    known = saved_report(folder, checkpoint_step(newest_checkpoint(folder / "nerfstudio_models")))
     if known is not None and ("lpips" in known.means or not has_lpips()):
         return known.means
     return evaluate_run(folder / "config.yml", folder / REPORT_FILE).means
-
-
-def save_picture(picture: Float[Tensor, "H W 3"], path: Path) -> None:
-    """Saves a picture in [0, 1]."""
-    save_image(picture.detach().cpu().permute(2, 0, 1), path)
 
 
 def loss_traces(folder: Path) -> Dict[str, Trace]:

@@ -1,7 +1,6 @@
 """Training the runs that a table needs: each once, resumable, several at a time where the machine has room.
 
-A run's folder carries a digest of everything that decides the outcome, so that a run is found again by what it is: a
-finished one is used as it is, an interrupted one is gone on with.
+A run's folder carries a digest of all that decides the outcome: a finished run is used, an interrupted one goes on.
 """
 
 import hashlib
@@ -13,51 +12,49 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Callable, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple
+from typing import Callable, Dict, List, Mapping, Optional, Sequence, Tuple
 
 import torch
 import yaml
+from nerfstudio.scripts import train
 
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.studies.study import Stage, Study
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
-from sparsestyle_ns.utils.progress import PROGRESS_FILE, ProgressReport, bar, duration, say
+from sparsestyle_ns.utils.progress import PROGRESS_FILE, ProgressReport, bar, duration, report, say
 
 SECONDS_FILE = "training_seconds.json"
-TRAINING_PROCESS = (sys.executable, "-m", "sparsestyle_ns.studies.training_process")
+TRAINING_PROCESS = (sys.executable, "-m", "sparsestyle_ns.studies.run_queue")
+"""Followed by a config's file, it trains a run in a process of its own."""
 CORES_PER_JOB = 4
 """CPU cores that a run makes good use of."""
 SECONDS_BETWEEN_LOOKS = 2.0
 """At how far a run is."""
 PICTURE_SIDE = 256
 """Longer side, in pixels, of pictures of a run on its way."""
+Settings = Mapping[str, object]
+"""Values by their place in a method's config."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """A training run that a table needs.
-
-    Attributes:
-        study: its scene and presets.
-        output_dir: what `ns-train --output-dir` names.
-        name: short name, part of the run's folder.
-        stage: which of the two.
-        settings: beside the preset's, by their place in the config, as pairs.
-        painting: the style image, of a stylised run.
-        coarse: the run whose field it stylises.
-        pictures: iterations after which a picture is made of it on its way (see `preview_path`).
-    """
+    """A training run that a table needs."""
 
     study: Study
     output_dir: Path
+    """What `ns-train --output-dir` names."""
     name: str
+    """Part of the run's folder."""
     stage: Stage
     settings: Tuple[Tuple[str, object], ...] = ()
+    """`Settings` beside the preset's, as pairs."""
     painting: Optional[Path] = None
     coarse: Optional["Run"] = None
+    """The run whose field it stylises."""
     pictures: Tuple[int, ...] = ()
+    """Iterations after which a picture is made of it on its way (see `preview_path`)."""
 
     @property
     def method(self) -> str:
@@ -112,34 +109,24 @@ class Run:
         return config
 
 
-class TimeSpent(NamedTuple):
-    """What a run has taken so far, all its processes together."""
-
-    seconds: float
-    iterations: int
-
-    @classmethod
-    def read(cls, path: Path) -> "TimeSpent":
-        """From a file; nothing where there is none, or one that was cut short."""
-        try:
-            return cls(**json.loads(path.read_text()))
-        except (OSError, ValueError, TypeError):
-            return cls(0.0, 0)
+def time_spent(path: Path) -> Dict[str, float]:
+    """Seconds and iterations of all processes of a run so far; zeros where the file is missing or was cut short."""
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {"seconds": 0.0, "iterations": 0}
 
 
 @dataclass
 class RunQueue:
-    """Trains the runs of one study.
-
-    Attributes:
-        folder: where they all are; has their logs, too.
-        jobs: runs at a time; None for one on a machine of few cores or with a GPU, else one for every four cores.
-        say: told what goes on, a line at a time.
-    """
+    """Trains the runs of one study."""
 
     folder: Path
+    """Where they all are; has their logs, too."""
     jobs: Optional[int] = None
+    """Runs at a time; None for one on a machine of few cores or with a GPU, else one for every four cores."""
     say: Callable[[str], None] = say
+    """Told what goes on, a line at a time."""
 
     def train(self, runs: Sequence[Run]) -> None:
         """Brings all runs, and the coarse ones they build on, to their end; named twice, one is trained once.
@@ -147,34 +134,32 @@ class RunQueue:
         Raises:
             InputError: a run failed, or Ctrl-C was pressed; either way what is done is kept.
         """
+        wanted = list(dict.fromkeys([*(run.coarse for run in runs if run.coarse is not None), *runs]))
+        self.say(self.forecast(wanted))
         try:
-            self._train_all(list(dict.fromkeys(runs)))
+            for has_coarse in (False, True):
+                stage = [run for run in wanted if (run.coarse is not None) is has_coarse and not run.is_finished]
+                self._train_beside_each_other(stage, wanted)
         except KeyboardInterrupt as interrupt:
             raise InputError("Interrupted; the same command goes on where it was.") from interrupt
 
-    def _train_all(self, runs: Sequence[Run]) -> None:
-        coarse = list(dict.fromkeys(run.coarse for run in runs if run.coarse is not None))
-        wanted = [*coarse, *(run for run in runs if run not in coarse)]
-        self.say(self.forecast(wanted))
+    def _train_beside_each_other(self, runs: Sequence[Run], wanted: Sequence[Run]) -> None:
+        jobs = max(1, min(self._jobs(), len(runs)))
 
-        def train(run: Run, jobs: int) -> None:
+        def train(run: Run) -> None:
             self._train(run, jobs)
             if not all(other.is_finished for other in wanted):
                 self.say(self.forecast(wanted))
 
-        for stage in (coarse, runs):
-            left = [run for run in stage if not run.is_finished]
-            jobs = min(self._jobs(), len(left))
-            if jobs < 2:  # in this thread, which is the one that Ctrl-C reaches
-                for run in left:
-                    train(run, 1)
-                continue
-            with ThreadPoolExecutor(jobs) as pool:
-                try:
-                    list(pool.map(lambda run, jobs=jobs: train(run, jobs), left))
-                except BaseException:
-                    pool.shutdown(cancel_futures=True)
-                    raise
+        if jobs == 1:  # in this thread, which is the one that Ctrl-C reaches
+            list(map(train, runs))
+            return
+        with ThreadPoolExecutor(jobs) as pool:
+            try:
+                list(pool.map(train, runs))
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
 
     def forecast(self, wanted: Sequence[Run]) -> str:
         """How much is to do and how long it will take, by what earlier runs of the same methods took."""
@@ -198,9 +183,9 @@ class RunQueue:
         """Of each method the mean over its runs that are on this disk."""
         rates: Dict[str, List[float]] = {}
         for path in self.folder.glob(f"*/*/{SECONDS_FILE}"):
-            spent = TimeSpent.read(path)
-            if spent.iterations > 0:
-                rates.setdefault(path.parents[1].name, []).append(spent.seconds / spent.iterations)
+            spent = time_spent(path)
+            if spent["iterations"] > 0:
+                rates.setdefault(path.parents[1].name, []).append(spent["seconds"] / spent["iterations"])
         return {method: sum(values) / len(values) for method, values in rates.items()}
 
     def _train(self, run: Run, jobs: int) -> None:
@@ -213,20 +198,19 @@ class RunQueue:
         environment = {**os.environ, PROGRESS_FILE: str(progress)}
         if jobs > 1:
             environment["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // jobs))
+        command = [*TRAINING_PROCESS, str(config_path)]
         with (
             log.open("a") as output,
-            subprocess.Popen(
-                [*TRAINING_PROCESS, str(config_path)], stdout=output, stderr=subprocess.STDOUT, env=environment
-            ) as process,
+            subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment) as process,
         ):
             _follow(process, progress, name, total, done)
         if process.returncode != 0 or not run.is_finished:
             failure = ProgressReport.read(progress).failure or f"its process ended with status {process.returncode}"
             raise InputError(f"The run {name} didn't finish ({failure}); all it said is in {log}.")
-        seconds, before = time.monotonic() - start, TimeSpent.read(run.folder / SECONDS_FILE)
+        seconds, spent = time.monotonic() - start, time_spent(run.folder / SECONDS_FILE)
         self.say(f"{name}: {total - done} iterations in {duration(seconds)}")
-        spent = TimeSpent(before.seconds + seconds, before.iterations + total - done)
-        write_whole(run.folder / SECONDS_FILE, json.dumps(spent._asdict()) + "\n")
+        spent = {"seconds": spent["seconds"] + seconds, "iterations": spent["iterations"] + total - done}
+        write_whole(run.folder / SECONDS_FILE, json.dumps(spent) + "\n")
 
 
 def _follow(process: subprocess.Popen, progress: Path, name: str, iterations: int, done: int) -> None:
@@ -244,6 +228,18 @@ def _follow(process: subprocess.Popen, progress: Path, name: str, iterations: in
                         shown.reach(work.done)
 
 
-def as_pairs(*settings: Mapping[str, object]) -> Tuple[Tuple[str, object], ...]:
-    """Settings as a run has them; of those that are given twice the last counts."""
-    return tuple({place: value for part in settings for place, value in part.items()}.items())
+def train_run(config: SparseStyleTrainerConfig) -> None:
+    """What ns-train does once it has read its command line; reports why it didn't where it fails."""
+    try:
+        train.main(config)
+    except SystemExit as end:  # so an InputError ends, with its sentence
+        if end.code:
+            report(ProgressReport(failure=str(end.code)))
+        raise
+    except Exception as error:
+        report(ProgressReport(failure=f"{type(error).__name__}: {error}"))
+        raise
+
+
+if __name__ == "__main__":
+    train_run(yaml.load(Path(sys.argv[1]).read_text(encoding="utf-8"), Loader=yaml.Loader))

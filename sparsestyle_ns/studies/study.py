@@ -4,6 +4,7 @@ import copy
 import functools
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal, Mapping, Optional, Tuple, TypeVar
 
 import tyro
@@ -18,17 +19,9 @@ C = TypeVar("C")
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """A scene and the presets of both stages on it.
+    """A scene and the presets of both stages on it; what is None is as in the preset.
 
-    Attributes:
-        data: folder or file of the scene.
-        dataparser: how it is read.
-        draft: whether the presets are the drafts.
-        max_image_side: longer side of the photos in pixels; None: the preset's.
-        num_views, view_ids: the photos to train on, as for ns-train.
-        vgg_weights, backbone: the feature network, as for ns-train.
-        coarse_iterations, style_iterations: of each stage; None: the preset's.
-        coarse_flags, style_flags: more flags of ns-train for all runs of each stage.
+    Flags are those of ns-train, for all runs of each stage; they win over all settings.
     """
 
     data: Path
@@ -63,14 +56,9 @@ class Study:
         return self.coarse_flags if stage == "coarse-fewshot" else self.style_flags
 
     def config(
-        self, stage: Stage, settings: Optional[Mapping[str, object]] = None, style_image: Optional[Path] = None
+        self, stage: Stage, settings: Mapping[str, object] = MappingProxyType({}), style_image: Optional[Path] = None
     ) -> SparseStyleTrainerConfig:
-        """The preset of a stage on this scene, with other settings on top.
-
-        Args:
-            stage: which.
-            settings: by their place in the config; the study's own flags win over them.
-            style_image: the painting.
+        """The preset of a stage on this scene, with other settings, by their place in the config, on top.
 
         Raises:
             SystemExit: there is no such flag; what is wrong has been printed.
@@ -84,7 +72,7 @@ class Study:
         config.max_num_iterations = self.iterations(stage)
         if stage == "hier-style":
             pipeline.style_image = style_image
-        for place, value in (settings or {}).items():
+        for place, value in settings.items():
             config = with_setting(config, place, value)
         flags = self.flags(stage)
         if not flags:
@@ -98,20 +86,12 @@ def _part(config: object, name: str) -> object:
 
 
 def get_setting(config: object, place: str) -> object:
-    """The value at a place in a config, such as pipeline.model.num_steps.
-
-    Raises:
-        AttributeError: there is no such setting.
-    """
+    """The value at a place in a config, such as pipeline.model.num_steps; an AttributeError where there is none."""
     return functools.reduce(_part, place.split("."), config)
 
 
 def with_setting(config: C, place: str, value: object) -> C:
-    """A config that differs in the value at one place; it shares its other parts with the given one.
-
-    Raises:
-        AttributeError: there is no such setting.
-    """
+    """A config that differs in the value at one place, or an AttributeError; its other parts are the given one's."""
     name, _, rest = place.partition(".")
     before = _part(config, name)
     changed = {name: with_setting(before, rest, value) if rest else value}

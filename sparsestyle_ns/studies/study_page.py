@@ -19,28 +19,20 @@ Captioned = List[Tuple[str, Path]]
 
 @dataclass
 class Section:
-    """A part of the page; all texts are plain.
-
-    Attributes:
-        heading: above it.
-        text: a paragraph on what is shown.
-        lines: a list below it.
-        tables: figures.
-        plots: with their captions.
-        grid: rows of pictures, each with a name.
-        note: a paragraph below all, in small type.
-        facts: what it depends on, by name.
-        parts: smaller sections in it.
-    """
+    """A part of the page; all texts are plain."""
 
     heading: str
     text: str = ""
     lines: Sequence[str] = ()
+    """A list below the text."""
     tables: Sequence[Table] = ()
     plots: Sequence[Plot] = ()
     grid: Sequence[Tuple[str, Captioned]] = ()
+    """Rows of pictures, each with a name."""
     note: str = ""
+    """A paragraph below all, in small type."""
     facts: Dict[str, str] = field(default_factory=dict)
+    """What it depends on, by name."""
     parts: Sequence["Section"] = ()
 
 

@@ -19,16 +19,10 @@ class OutOfTimeError(Exception):
 
 
 class Budget:
-    """Seconds that may be spent from now on.
-
-    Args:
-        seconds: how many.
-        clock: what time it is.
-    """
+    """Seconds that may be spent from now on, by a clock."""
 
     def __init__(self, seconds: float, clock: Clock = time.perf_counter) -> None:
-        self.clock = clock
-        self.start = clock()
+        self.clock, self.start = clock, clock()
         self.end = self.start + seconds
 
     @property
@@ -48,11 +42,7 @@ class Budget:
         return part
 
     def check(self, needed: float = 0.0) -> None:
-        """Goes on only if more than this is left.
-
-        Raises:
-            OutOfTimeError: it isn't.
-        """
+        """Raises an `OutOfTimeError` unless more than `needed` seconds are left."""
         if self.left <= needed:
             raise OutOfTimeError
 
@@ -74,27 +64,17 @@ def parse_duration(text: str) -> float:
 
 @dataclass
 class Plan:
-    """How to measure some curves together.
-
-    Attributes:
-        curves: take the points.
-        weight: their part of the time, beside those of the plans that follow.
-        measure: measures them within a budget; what it has added to them when it stops counts.
-    """
+    """How to measure some curves together."""
 
     curves: Sequence[Curve]
     weight: float
+    """Their part of the time, beside those of the plans that follow."""
     measure: Callable[[Budget], None]
+    """Measures them within a budget; what it has added to them when it stops counts."""
 
 
 def run_plans(plans: Sequence[Plan], budget: Budget, begin: Callable[[Plan], None] = lambda plan: None) -> None:
-    """Measures one plan after another. Time that one leaves over is shared among those that follow.
-
-    Args:
-        plans: in order.
-        budget: for all of them.
-        begin: is told of each before it is measured.
-    """
+    """Measures one plan after another, each told to `begin`; time that one leaves over goes to those that follow."""
     for index, plan in enumerate(plans):
         share = budget.left * plan.weight / sum(later.weight for later in plans[index:])
         begin(plan)
@@ -108,41 +88,33 @@ def run_plans(plans: Sequence[Plan], budget: Budget, begin: Callable[[Plan], Non
 
 @dataclass
 class Case:
-    """Settings that are measured together, once in each round.
-
-    Attributes:
-        points: the curves that what is found belongs to, and the value of the setting there.
-        measure: given the number of the round, what was found by the moment in a run (see `Point.moment`). A curve
-            takes what has its metric of time.
-    """
+    """Settings that are measured together, once in each round."""
 
     points: Sequence[Tuple[Curve, object]]
+    """The curves that what is found belongs to, and the value of the setting there."""
     measure: Callable[[int], Mapping[str, Values]]
+    """Given the round's number, what was found by the moment in a run. A curve takes what has its metric of time."""
 
 
 def in_turns(cases: Sequence[Case], budget: Budget, rounds: int, watch: LoadWatch) -> None:
-    """Measures cases in turn, A B C A B C …, until each has all its rounds or time is over.
+    """Measures cases in turn, A B C A B C …, until each has all its rounds or time is over; slow spells meet all alike.
 
-    So a slow spell of the machine meets all of them. A case that took longer than what is left isn't begun again, nor
-    a new one where the latest other took longer; one that never was is left out, and its curves say so.
-
-    Args:
-        rounds: repetitions of each at most.
+    A case that took longer than what is left isn't begun again, nor a new one where the latest other took longer; one
+    that never was is left out, and its curves say so.
     """
     costs: Dict[int, float] = {}
     latest = 0.0
     try:
-        for round_ in range(rounds):
-            for number, case in enumerate(cases):
-                if budget.left <= costs.get(number, latest):
-                    continue
-                start = budget.clock()
-                with watch:
-                    found = case.measure(round_)
-                costs[number] = latest = budget.clock() - start
-                for (curve, setting), (moment, values) in itertools.product(case.points, found.items()):
-                    if curve.time in values:
-                        curve.add(setting, values, watch.busy, moment)
+        for round_, (number, case) in itertools.product(range(rounds), enumerate(cases)):
+            if budget.left <= costs.get(number, latest):
+                continue
+            start = budget.clock()
+            with watch:
+                found = case.measure(round_)
+            costs[number] = latest = budget.clock() - start
+            for (curve, setting), (moment, values) in itertools.product(case.points, found.items()):
+                if curve.time in values:
+                    curve.add(setting, values, watch.busy, moment)
     except OutOfTimeError:
         pass
     finally:

@@ -1,12 +1,10 @@
 """`sparsestyle tradeoff`: measures all curves within a budget and writes the report, also when it is stopped."""
 
-import contextlib
 import gc
 import tempfile
 import warnings
 from datetime import datetime, timezone
-from pathlib import Path
-from typing import Dict, Iterator, List, Tuple
+from typing import Dict, List, Tuple
 
 import rich
 import torch
@@ -15,12 +13,12 @@ from rich.console import Console
 
 from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.engine.hints import finish, scene_arguments
-from sparsestyle_ns.studies.measure_rendering import baking_plan, precision_plan, quadrature_plans
+from sparsestyle_ns.studies.measure_rendering import altered, baking_plan, precision_plan, quadrature_plans
 from sparsestyle_ns.studies.measure_training import StageRuns
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.studies.study_options import TradeoffOptions
 from sparsestyle_ns.studies.time_budget import Budget, Plan, parse_duration, run_plans
-from sparsestyle_ns.studies.tradeoff_report import GROUPS, Fact, Report, cant_write
+from sparsestyle_ns.studies.tradeoff_report import GROUPS, Fact, Report, writing_to
 from sparsestyle_ns.studies.workbench import Workbench
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.machine import device_name, versions
@@ -31,11 +29,7 @@ REPORT_SHARE = 0.05
 
 
 def tradeoff(options: TradeoffOptions) -> None:
-    """Measures, writes the report, and prints the recommendation.
-
-    Raises:
-        InputError: something in the options can't be used.
-    """
+    """Measures, writes the report, and prints the recommendation; an `InputError` if an option can't be used."""
     budget_seconds = parse_duration(options.budget)
     if options.rounds < 1:
         raise InputError(f"--rounds is {options.rounds}, but has to be at least 1.")
@@ -50,35 +44,27 @@ def tradeoff(options: TradeoffOptions) -> None:
     if left_out:
         lines += [f"Left out, {len(left_out)}:", *(f"  {line}" for line in left_out)]
     Console().print(*lines, sep="\n", markup=False, highlight=False, soft_wrap=True)
-    method = study.method("coarse-fewshot")
-    finish(page.resolve(), ["ns-train", method, *scene_arguments(study.config("coarse-fewshot"))])
+    config = study.config("coarse-fewshot")
+    finish(page.resolve(), ["ns-train", config.method_name, *scene_arguments(config)])
 
 
 def study_of(options: TradeoffOptions) -> Study:
     """The scene and the presets that the options name."""
-    return Study(
-        options.data,
-        parse_dataparser(options.dataparser, options.data),
-        draft=not options.full,
-        max_image_side=options.max_image_side,
-        num_views=options.num_views,
-        view_ids=options.view_ids,
-        vgg_weights=options.vgg_weights,
-        backbone=options.backbone,
-    )
+    named = ("max_image_side", "num_views", "view_ids", "vgg_weights", "backbone")
+    settings = {name: getattr(options, name) for name in named}
+    return Study(options.data, parse_dataparser(options.dataparser, options.data), draft=not options.full, **settings)
 
 
 def measure(study: Study, options: TradeoffOptions, budget: Budget) -> Report:
-    """Measures what fits into the budget.
-
-    Ctrl-C ends it; what has been measured is in the report.
-
-    Raises:
-        InputError: the scene, the painting or the coarse run can't be used.
-    """
-    check_folder(options.output_dir)
+    """Measures what fits into the budget; Ctrl-C ends it, and what has been measured is in the report."""
+    with writing_to(options.output_dir):  # known before anything is measured
+        options.output_dir.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=options.output_dir).close()
     seconds, stopped = budget.left, []
-    with quiet(), rich.console.Console().status("Loading the scene") as status:
+    # The lines and warnings of nerfstudio and of the methods stay away from the terminal.
+    quiet = altered(CONSOLE, quiet=True), altered(rich.get_console(), quiet=True)
+    with quiet[0], quiet[1], warnings.catch_warnings(), Console().status("Loading the scene") as status:
+        warnings.simplefilter("ignore")
         bench = Workbench(study, budget, options.style_image, options.coarse_run, options.rounds)
         plans, left_out = all_plans(bench, options)
 
@@ -100,15 +86,12 @@ def measure(study: Study, options: TradeoffOptions, budget: Budget) -> Report:
 
 def all_plans(bench: Workbench, options: TradeoffOptions) -> Tuple[List[Plan], List[str]]:
     """What to measure, in order, and the groups that can't be, with the reason."""
-    asked = options.groups or tuple(GROUPS)
+    asked, has_style = options.groups or tuple(GROUPS), bench.targets is not None
     of_style = [group for group in ("fine-field", "style") if group in asked]
-    has_style = bench.targets is not None
     reason = "there is no painting; name one with --style-image."
     left_out = [] if has_style else [f"{GROUPS[group]}: {reason}" for group in of_style]
     coarse, style = StageRuns(bench, is_style=False), StageRuns(bench, is_style=True)
-    plans: List[Plan] = []
-    if "training" in asked or bench.trains_coarse:
-        plans.append(coarse.long_plan())
+    plans = [coarse.long_plan()] if "training" in asked or bench.trains_coarse else []
     if has_style and set(asked) != {"training"}:
         plans.append(style.long_plan())
     if "quadrature" in asked:
@@ -122,36 +105,6 @@ def all_plans(bench: Workbench, options: TradeoffOptions) -> Tuple[List[Plan], L
     if has_style and of_style:
         plans.append(style.short_plan(of_style))
     return plans, left_out
-
-
-def check_folder(folder: Path) -> None:
-    """Makes the folder of the report before anything is measured.
-
-    Raises:
-        InputError: it can't be written to.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise cant_write(folder, error) from error
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Keeps nerfstudio's and the methods' lines and warnings from the terminal."""
-    consoles = (CONSOLE, rich.get_console())
-    before = [console.quiet for console in consoles]
-    for console in consoles:
-        console.quiet = True
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        for console, was in zip(consoles, before, strict=True):
-            console.quiet = was
 
 
 def facts(bench: Workbench, options: TradeoffOptions, seconds: float) -> Dict[str, Fact]:

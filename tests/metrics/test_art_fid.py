@@ -27,7 +27,7 @@ from sparsestyle_ns.metrics.art_fid import (
 )
 from sparsestyle_ns.metrics.image import ALEXNET_FILE, lpips_metric
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
-from sparsestyle_ns.studies.paper_tables import style_table
+from sparsestyle_ns.studies.paper_studies import style_table
 from sparsestyle_ns.studies.run_figures import PaintingMeasure, RunFigures, read_figures
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError

@@ -11,7 +11,7 @@ from conftest import TINY
 
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.engine.previews import preview_path, preview_steps
-from sparsestyle_ns.studies import run_queue, training_process
+from sparsestyle_ns.studies import run_queue
 from sparsestyle_ns.studies.paper_runs import PaperRuns
 from sparsestyle_ns.studies.run_queue import SECONDS_FILE, Run, RunQueue
 from sparsestyle_ns.studies.study import Study
@@ -185,10 +185,10 @@ def test_a_training_process_reports_why_it_failed(
     def fail(config: object) -> None:
         raise failure
 
-    monkeypatch.setattr(training_process.train, "main", fail)
+    monkeypatch.setattr(run_queue.train, "main", fail)
     monkeypatch.setenv(PROGRESS_FILE, str(tmp_path / "progress.json"))
     with pytest.raises(type(failure)):
-        training_process.train_run(None)
+        run_queue.train_run(None)
     assert ProgressReport.read(tmp_path / "progress.json").failure == sentence
 
 

@@ -17,9 +17,9 @@ from sparsestyle_ns import cli
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.engine.previews import preview_path
-from sparsestyle_ns.studies import paper_tables, run_figures
+from sparsestyle_ns.studies import paper_studies, run_figures
 from sparsestyle_ns.studies.paper_runs import COARSE_KINDS, STYLE_KINDS, PaperRuns
-from sparsestyle_ns.studies.paper_tables import (
+from sparsestyle_ns.studies.paper_studies import (
     OF_METHODS,
     PAPER_ROWS,
     ROWS_OF_2D,
@@ -150,8 +150,8 @@ def arguments(command: str, scene: Path, painting: Path, folder: Path, style_ite
 @pytest.fixture
 def painted_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """Has frames turned to their negatives in place of the 2D network, which may be missing and needs larger ones."""
-    monkeypatch.setattr(paper_tables, "can_transfer", lambda: True)
-    monkeypatch.setattr(paper_tables, "transfer_frames", lambda frames, painting: [1.0 - frame for frame in frames])
+    monkeypatch.setattr(paper_studies, "can_transfer", lambda: True)
+    monkeypatch.setattr(paper_studies, "transfer_frames", lambda frames, painting: [1.0 - frame for frame in frames])
 
 
 def test_compare_trains_what_is_missing_measures_each_row_and_writes_the_page(
@@ -187,7 +187,7 @@ def test_compare_trains_what_is_missing_measures_each_row_and_writes_the_page(
     assert (tmp_path / "compare.html").read_text() == page
     assert "5 runs, 5 of them finished." in capsys.readouterr().out
 
-    monkeypatch.setattr(paper_tables, "can_transfer", lambda: False)
+    monkeypatch.setattr(paper_studies, "can_transfer", lambda: False)
     main(given)
     page = (tmp_path / "compare.html").read_text()
     assert shown("isn't installed") in page

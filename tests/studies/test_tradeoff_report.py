@@ -8,8 +8,7 @@ import re
 import pytest
 
 from sparsestyle_ns.studies.advice import duration, recommendation, setting_line
-from sparsestyle_ns.studies.curves import Curve
-from sparsestyle_ns.studies.pareto import root_mean_square
+from sparsestyle_ns.studies.curves import Curve, root_mean_square
 from sparsestyle_ns.studies.tradeoff_report import Report
 from sparsestyle_ns.utils.errors import InputError
 

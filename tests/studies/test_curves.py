@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from sparsestyle_ns.studies.pareto import (
+from sparsestyle_ns.studies.curves import (
     decibels,
     decibels_lost,
     error_that_costs,
