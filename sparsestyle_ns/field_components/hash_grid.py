@@ -22,27 +22,21 @@ HASH_PRIMES = (1, 2654435761, 805459861)
 
 
 class Corners(NamedTuple):
-    """The corners of the cells that points lie in.
-
-    Attributes:
-        rows: of the joined table, for the eight corners of each point's cell on each level.
-        weights: trilinear weights of those corners; they sum to 1 on each level.
-    """
+    """The eight corners of the cells that points lie in."""
 
     rows: Int[Tensor, "points levels 8"]
+    """Of the joined table."""
     weights: Float[Tensor, "points levels 8"]
+    """Trilinear; they sum to 1 on each level."""
 
 
 class GridLocation(NamedTuple):
-    """Where points lie in a hash grid.
-
-    Attributes:
-        positions: of the points, in [0, 1].
-        corners: of their cells; None where there are kernels, which work them out faster than they could read them.
-    """
+    """Where points lie in a hash grid."""
 
     positions: Float[Tensor, "points 3"]
+    """In [0, 1]."""
     corners: Optional[Corners]
+    """None where there are kernels, which work them out faster than they could read them."""
 
     @property
     def num_bytes(self) -> int:
@@ -129,13 +123,7 @@ class _Fused(torch.autograd.Function):
 class HashGrid(FieldComponent):
     """ψ(x): `num_levels` grids of features, each hashed into a table.
 
-    Args:
-        num_levels: M.
-        min_resolution: N_min, cells along the cube's side on the first level.
-        max_resolution: N_max, on the last.
-        features_per_level: length of a table row.
-        log2_table_size: log2 of the rows a level has.
-        init_scale: rows start uniform in ± this.
+    Resolutions are cells along the cube's side on the first and the last level; rows start uniform in ± `init_scale`.
     """
 
     def __init__(

@@ -94,9 +94,7 @@ def _scatter(
 
 
 def gather(
-    table: Float[Tensor, "levels rows features"],
-    positions: Float[Tensor, "points 3"],
-    resolutions: Tuple[int, ...],
+    table: Float[Tensor, "levels rows features"], positions: Float[Tensor, "points 3"], resolutions: Tuple[int, ...]
 ) -> Float[Tensor, "points encoded"]:
     """ψ(x), as `hash_grid_kernels.gather`."""
     encoded = table.new_empty(len(positions), table.shape[0] * table.shape[2])

@@ -27,11 +27,7 @@ class PointEncoding(Protocol):
 
 
 class FrequencyEncoding(FieldComponent):
-    """x and sin(2^k x), cos(2^k x), k = 0 … L − 1, of field coordinates; γ(x) of Eq. 1 with more octaves.
-
-    Args:
-        num_levels: L. Ten octaves have waves of 2π/512, shorter than three cells of the finest hash level.
-    """
+    """γ(x) of Eq. 1 with more octaves: ten have waves of 2π/512, shorter than three cells of the finest hash level."""
 
     def __init__(self, num_levels: int) -> None:
         super().__init__(in_dim=3, out_dim=3 * (1 + 2 * num_levels))

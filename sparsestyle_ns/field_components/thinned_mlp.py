@@ -18,15 +18,12 @@ from sparsestyle_ns.core.precision import at_least_float32
 
 
 class Thinning(NamedTuple):
-    """How many points the backward pass is spared.
-
-    Attributes:
-        threshold: gradients of at least this many times the points' mean always count; 0 spares none.
-        generator: source of random numbers, on the points' device; None is torch's own.
-    """
+    """How many points the backward pass is spared."""
 
     threshold: float
+    """Gradients of at least this many times the points' mean always count; 0 spares none."""
     generator: Optional[torch.Generator] = None
+    """On the points' device."""
 
 
 def thin(

@@ -14,10 +14,7 @@ def in_chunks(function: Callable[..., Tuple[Tensor, ...]], *inputs: Tensor) -> T
     """`function(*inputs)`, a piece of the points at a time where no gradient is asked for.
 
     With gradients all points are evaluated at once: their hidden layers are kept for the backward pass anyhow.
-
-    Args:
-        function: evaluates points, one a row of each input, on its own; gives one row of each output for each.
-        inputs: [points, …] each.
+    `function` evaluates points, one a row of each input, on its own, and gives one row of each output for each.
     """
     size = POINTS_PER_CHUNK["cpu" if inputs[0].device.type == "cpu" else "cuda"]
     if torch.is_grad_enabled() or len(inputs[0]) <= size:

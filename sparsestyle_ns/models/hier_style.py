@@ -15,8 +15,7 @@ from sparsestyle_ns.core.occupancy import Occupancy, march
 from sparsestyle_ns.core.precision import Precision, autocast
 from sparsestyle_ns.core.spaces import Segments
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
-from sparsestyle_ns.fields.fine import FineFieldConfig, StylisedField
-from sparsestyle_ns.fields.fine_tuned import FineTunedField
+from sparsestyle_ns.fields.fine import FineFieldConfig, FineTunedField, StylisedField
 from sparsestyle_ns.metrics.image import image_metrics
 from sparsestyle_ns.models.scene_model import SceneModel
 from sparsestyle_ns.rendering.baked import BakedVolume, shade_of

@@ -18,23 +18,16 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from sparsestyle_ns.core import spaces
 from sparsestyle_ns.core.occupancy import Occupancy
 from sparsestyle_ns.core.precision import Precision, autocast
 from sparsestyle_ns.core.sampling import even_edges
-from sparsestyle_ns.core.spaces import (
-    MAX_DISTANCE,
-    ContractedSegments,
-    ForwardFacingSpace,
-    LinearSegments,
-    Segments,
-    Space,
-    spacing,
-)
+from sparsestyle_ns.core.spaces import Segments, Space
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.rendering import baked_kernels
 from sparsestyle_ns.rendering.mixing import STYLISED, Appearance, Mix, mixed
-from sparsestyle_ns.rendering.render import POINTS_PER_CALL, PackedRender, composite, render_packed
+from sparsestyle_ns.rendering.render import POINTS_PER_CALL, Background, PackedRender, composite, render_packed
 from sparsestyle_ns.rendering.visible_samples import Marching, visible_samples
 from sparsestyle_ns.utils.numba_kernels import even_parts, run_on_threads
 
@@ -84,7 +77,7 @@ def shade_of(field: CoarseField, style: StylisedField, space: Space, precision: 
     scene, and elsewhere the mean over the directions of the axes; c_f and the densities depend on no direction.
     """
     seen_from = ALL_AROUND
-    if field.direction_encoding is None or isinstance(space, ForwardFacingSpace):
+    if field.direction_encoding is None or isinstance(space, spaces.ForwardFacingSpace):
         seen_from = AHEAD
 
     def shade(points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 8"]:
@@ -102,13 +95,8 @@ def shade_of(field: CoarseField, style: StylisedField, space: Space, precision: 
 class BakedVolume:
     """σ_c, σ_f, c_f and c_c on a grid of the cube [−1, 1]³, filled where it is asked for.
 
-    Voxels lie in bricks of 8³, and a brick takes memory, 4 KiB, from its first value on: at most 147 MB with 256 cells
-    along a side, where rays have been everywhere. Outside of the cube the values on its border count.
-
-    Args:
-        shade: the fields.
-        resolution: cells along a side; voxels lie at their corners.
-        device: where the values are kept.
+    Voxels lie at the corners of `resolution` cells along a side, in bricks of 8³. A brick takes memory, 4 KiB, from its
+    first value on: at most 147 MB with 256 cells along a side. Outside of the cube the values on its border count.
     """
 
     def __init__(self, shade: Shade, resolution: int, device: torch.device) -> None:
@@ -143,11 +131,7 @@ class BakedVolume:
 
     @torch.no_grad()
     def fill(self, cells: Int[Tensor, "cells 3"]) -> None:
-        """Evaluates the voxels at the corners of cells, those that haven't been before.
-
-        Args:
-            cells: their lower corners.
-        """
+        """Evaluates the voxels at the corners of cells, given by their lower ones, that haven't been before."""
         lower = _unravel(_ravel(cells, self.resolution).unique(), self.resolution)
         voxels = (lower[:, None] + self._offsets).flatten(0, 1)
         voxels = voxels[self.codes.view(-1, 8)[self.rows(voxels), 0] == 0]
@@ -204,15 +188,13 @@ def render_baked(
     volume: BakedVolume,
     segments: Segments,
     marching: Marching,
-    background: Optional[Float[Tensor, "3"]],
+    background: Background,
     mix: Mix = STYLISED,
     second: Optional[BakedVolume] = None,
 ) -> Tuple[PackedRender, PackedRender]:
     """The render of a mixture of the fields, by default the stylised one, and the coarse render.
 
-    Args:
-        mix: how much of each field counts.
-        second: of another style, with the same coarse field and resolution.
+    `second` is of another style, with the same coarse field and resolution.
     """
     march = march_compiled if volume.codes.device.type == "cpu" else march_in_torch
     return march(volume, segments, marching, background, mix, second)
@@ -223,22 +205,17 @@ def march_in_torch(
     volume: BakedVolume,
     segments: Segments,
     marching: Marching,
-    background: Optional[Float[Tensor, "3"]],
+    background: Background,
     mix: Mix = STYLISED,
     second: Optional[BakedVolume] = None,
 ) -> Tuple[PackedRender, PackedRender]:
     """`render_baked` on any device: the exact render, with the volumes in the fields' place."""
     samples, density, values = visible_samples(volume, segments, marching)
-    coarse, styles = Appearance(density, values[:, 4:]), [_style(values)]
-    if second is not None:
-        styles.append(_style(second.density_and_feature(samples.positions)[1]))
+    both = [values] if second is None else [values, second.density_and_feature(samples.positions)[1]]
+    coarse, styles = Appearance(density, values[:, 4:]), [Appearance(each[:, 0], each[:, 1:4]) for each in both]
     num_rays = len(segments.hit)
     render = render_packed(samples, num_rays, *mixed(coarse, styles, mix), background)
     return render, render_packed(samples, num_rays, *coarse, background)
-
-
-def _style(feature: Float[Tensor, "points 7"]) -> Appearance:
-    return Appearance(feature[:, 0], feature[:, 1:4])
 
 
 @torch.no_grad()
@@ -246,7 +223,7 @@ def march_compiled(
     volume: BakedVolume,
     segments: Segments,
     marching: Marching,
-    background: Optional[Float[Tensor, "3"]],
+    background: Background,
     mix: Mix = STYLISED,
     second: Optional[BakedVolume] = None,
 ) -> Tuple[PackedRender, PackedRender]:
@@ -255,19 +232,17 @@ def march_compiled(
     left = torch.arange(len(lines.hit))
     sums = torch.zeros(len(left), 10)
     shares = tuple(map(np.float32, (mix.density_share, mix.strength, mix.blend)))
+    volumes = [volume] if second is None else [volume, second]
     while len(left):
         missing = torch.full((len(left), baked_kernels.LOOKAHEAD), baked_kernels.NO_CELL)
-        voxels = [None if each is None else _voxels(each, marching.occupancy) for each in (volume, second)]
+        voxels = (*(_voxels(each, marching.occupancy) for each in volumes), None)[:2]
         results = (lines, *voxels, shares, np.float32(marching.min_transmittance), sums.numpy(), missing.numpy())
         parts = even_parts(len(left), -(-len(left) // RAYS_PER_PART))
         run_on_threads(baked_kernels.march_rays, [(left.numpy(), *part, *results) for part in parts])
         found = missing != baked_kernels.NO_CELL
         left = left[found[:, 0]]
-        if len(left):
-            cells = _unravel(missing[found], volume.resolution)
-            volume.fill(cells)
-            if second is not None:
-                second.fill(cells)
+        for each in volumes if len(left) else []:
+            each.fill(_unravel(missing[found], volume.resolution))
     return composite(sums[:, :5], background), composite(sums[:, 5:], background)
 
 
@@ -284,19 +259,19 @@ def _voxels(volume: BakedVolume, occupancy: Optional[Occupancy]) -> baked_kernel
 
 def _lines(segments: Segments, marching: Marching) -> baked_kernels.Lines:
     """Segments in the kernels' form."""
-    spaced = torch.zeros(2)
-    if isinstance(segments, ContractedSegments):
+    spaced, bent = torch.zeros(2), isinstance(segments, spaces.ContractedSegments)
+    if bent:
         parts = segments.origins, segments.directions
-        ends = spacing(torch.tensor([segments.near, MAX_DISTANCE]))
+        ends = spaces.spacing(torch.tensor([segments.near, spaces.MAX_DISTANCE]))
         spaced = torch.stack([ends[0], ends[1] - ends[0]])
-    elif isinstance(segments, LinearSegments):
+    elif isinstance(segments, spaces.LinearSegments):
         parts = segments.start, segments.extent
     else:
         raise TypeError(f"{type(segments).__name__} has no compiled form; use march_in_torch.")
     return baked_kernels.Lines(
         values=torch.cat(parts, dim=-1).float().numpy(),
         hit=segments.hit.numpy(),
-        bent=isinstance(segments, ContractedSegments),
+        bent=bent,
         unbounded=marching.unbounded,
         spaced=spaced.numpy(),
         edges=even_edges(1, marching.num_steps, segments.hit.device)[0].numpy(),

@@ -4,14 +4,13 @@ import threading
 from typing import Callable, Dict, Iterable, List, Optional, Sequence, Tuple
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from sparsestyle_ns.core.spaces import Segments
 from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.rendering.baked import BakedVolume, render_baked
 from sparsestyle_ns.rendering.mixing import STYLISED, Mix
-from sparsestyle_ns.rendering.render import PackedRender
+from sparsestyle_ns.rendering.render import Background, PackedRender
 from sparsestyle_ns.rendering.visible_samples import Marching
 
 MOST_BAKED = 4
@@ -25,15 +24,13 @@ class BakedCache:
 
     Args:
         bake: makes a style's volume, with nothing in it yet.
-        shared: the modules that the pictures of all styles depend on.
-
-    Attributes:
-        volumes: by style, the volume and the weights that it was made of; the style that was shown last comes last.
+        shared: gives the modules that the pictures of all styles depend on.
     """
 
     def __init__(self, bake: Callable[[StylisedField], BakedVolume], shared: Callable[[], Iterable[nn.Module]]) -> None:
         self._bake, self._shared = bake, shared
         self.volumes: Dict[StylisedField, Tuple[BakedVolume, List[Tensor]]] = {}
+        """By style, the volume and the weights that it was made of; the style that was shown last comes last."""
         self._lock = threading.Lock()  # volumes grow while they are rendered, and a viewer has several threads
 
     def render(
@@ -41,13 +38,10 @@ class BakedCache:
         styles: Sequence[StylisedField],
         segments: Segments,
         marching: Marching,
-        background: Optional[Float[Tensor, "3"]],
+        background: Background,
         mix: Mix = STYLISED,
     ) -> Tuple[PackedRender, PackedRender]:
-        """The render of a mixture of one or two styles, and the coarse render (see `render_baked`).
-
-        What these rays need and the volumes don't have yet is filled in.
-        """
+        """`render_baked` of one or two styles; what these rays need and the volumes don't have yet is filled in."""
         with self._lock:
             first, second = (*map(self._current, styles), None)[:2]
             return render_baked(first, segments, marching, background, mix, second)
@@ -58,16 +52,12 @@ class BakedCache:
         None where that picture would start a new one: it is the style's first, the weights have changed, or
         `MOST_BAKED` other styles were shown since the last one.
         """
-        return self._volume_of(style, self._weights(style))
-
-    def _volume_of(self, style: StylisedField, weights: List[Tensor]) -> Optional[BakedVolume]:
         volume, known = self.volumes.get(style, (None, []))
-        return volume if volume is not None and all(map(torch.equal, known, weights)) else None
+        return volume if volume is not None and all(map(torch.equal, known, self._weights(style))) else None
 
     def _current(self, style: StylisedField) -> BakedVolume:
         """A style's volume, a new one if what it shows has changed since the last picture."""
-        weights = self._weights(style)
-        volume = self._volume_of(style, weights) or self._bake(style)
+        weights, volume = self._weights(style), self.kept(style) or self._bake(style)
         # The viewer may break a picture off between any two lines; here that loses nothing.
         others = {each: kept for each, kept in self.volumes.items() if each is not style}
         self.volumes = dict([*others.items(), (style, (volume, weights))][-MOST_BAKED:])

@@ -5,6 +5,7 @@ checkpointing: its activations are computed again in the backward pass, so that 
 all at once while only one chunk's activations exist at a time.
 """
 
+from functools import partial
 from typing import Callable, List, Optional
 
 import torch
@@ -31,16 +32,10 @@ class FrozenView:
 
     Args:
         runs: the rays of each chunk.
-        freeze: gives the frozen samples of a run of rays.
         keep_bytes: memory that kept chunks may take; chunks past it are frozen again whenever they are rendered.
     """
 
-    def __init__(
-        self,
-        runs: List[slice],
-        freeze: Callable[[slice], FrozenSamples],
-        keep_bytes: float,
-    ) -> None:
+    def __init__(self, runs: List[slice], freeze: Callable[[slice], FrozenSamples], keep_bytes: float) -> None:
         self.runs = runs
         self.freeze = freeze
         self.kept: List[Optional[FrozenSamples]] = []
@@ -75,8 +70,7 @@ class FrozenView:
         def run(index: int) -> Tensor:
             return render_chunk(self.chunk(index))
 
-        if self.num_chunks == 1 or not torch.is_grad_enabled():
-            return torch.cat([run(index) for index in range(self.num_chunks)])
-        return torch.cat(
-            [checkpoint(run, index, use_reentrant=False, preserve_rng_state=False) for index in range(self.num_chunks)]
-        )
+        once = run
+        if self.num_chunks > 1 and torch.is_grad_enabled():
+            once = partial(checkpoint, run, use_reentrant=False, preserve_rng_state=False)
+        return torch.cat([once(index) for index in range(self.num_chunks)])

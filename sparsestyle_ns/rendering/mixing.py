@@ -18,13 +18,7 @@ from torch import Tensor
 
 
 class Mix(NamedTuple):
-    """How much of each field a picture shows; all in [0, 1].
-
-    Attributes:
-        strength: s, from the coarse field to a stylised one.
-        geometry: g, the share of the residual density that comes with the style.
-        blend: b, from the first style to the second; means nothing with one style.
-    """
+    """How much of each field a picture shows: s, g and b of the formulas above, all in [0, 1]."""
 
     strength: float = 1.0
     geometry: float = 1.0
@@ -60,6 +54,5 @@ def mixed(coarse: Appearance, styles: Sequence[Appearance], mix: Mix) -> Appeara
     if len(styles) > 1:
         density = interpolate(density, styles[1].density, mix.blend)
         color = interpolate(color, styles[1].color, mix.blend)
-    return Appearance(
-        interpolate(coarse.density, density, mix.density_share), interpolate(coarse.color, color, mix.strength)
-    )
+    density = interpolate(coarse.density, density, mix.density_share)
+    return Appearance(density, interpolate(coarse.color, color, mix.strength))

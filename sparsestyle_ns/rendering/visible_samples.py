@@ -17,19 +17,16 @@ SAMPLES_PER_PASS = 6
 
 @dataclass(frozen=True)
 class Marching:
-    """Where samples lie on a ray, and where it ends.
-
-    Attributes:
-        occupancy: which cells of the cube are empty and skipped; None: none.
-        num_steps: even steps along a ray.
-        unbounded: whether the last step goes on to infinity.
-        min_transmittance: share of light left, in [0, 1), at which a ray ends.
-    """
+    """Where samples lie on a ray, and where it ends."""
 
     occupancy: Optional[Occupancy]
+    """Which cells of the cube are empty and skipped; None: none."""
     num_steps: int
+    """Even steps along a ray."""
     unbounded: bool
+    """Whether the last step goes on to infinity."""
     min_transmittance: float
+    """Share of light left, in [0, 1), at which a ray ends."""
 
 
 class DensityField(Protocol):
@@ -58,13 +55,9 @@ def evaluate_front_to_back(
 ) -> Tuple[Int[Tensor, "seen"], Float[Tensor, "seen"], Float[Tensor, "seen feature"]]:
     """σ_c and e_c of those packed samples in front of which more than `min_transmittance` of the light is left.
 
-    A few samples of each ray are evaluated at a time, and none of a ray that has ended.
-
-    The result is the same each time, on a GPU too: a view that is frozen again in the backward pass must have the same
-    samples. So no depths are summed by atomic additions, as `index_add_` and long running sums do there.
-
-    Returns:
-        Which samples these are, ascending, and σ_c and e_c there.
+    They come with their ascending indices. The result is the same each time, on a GPU too: a view that is frozen again
+    in the backward pass must have the same samples. So no depths are summed by atomic additions, as `index_add_` and
+    long running sums do there.
     """
     on_ray = samples.ray_indices
     counts = torch.bincount(on_ray, minlength=num_rays)
