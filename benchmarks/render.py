@@ -85,7 +85,7 @@ def main(options: RenderOptions) -> None:
         return timed(work, report.device, prepare)
 
     def picture(camera: Cameras, mode: RenderMode) -> Tensor:
-        with model.rendering(mode):
+        with model.display.rendering(mode):
             return model.get_outputs_for_camera(camera)["rgb"]
 
     exact = contender("exact", lambda camera: picture(camera, "exact"))

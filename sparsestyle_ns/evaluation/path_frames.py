@@ -44,7 +44,7 @@ def render_path(model: HierStyleModel, cameras: Cameras) -> PathFrames:
     frames = PathFrames([], [], [])
     for index in track(range(len(cameras)), "Measuring path"):
         camera = cameras[index : index + 1].to(model.device)
-        with model.rendering("exact"):
+        with model.display.rendering("exact"):
             outputs = model.get_outputs_for_camera(camera)
         rays = camera.generate_rays(camera_indices=0, keep_shape=True)
         points = rays.origins + outputs["depth_coarse"] * rays.directions

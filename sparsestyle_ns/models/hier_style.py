@@ -1,6 +1,5 @@
 """`hier-style`: the coarse field, frozen, and the residual field that stylises it (stage 2)."""
 
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional, Tuple, Type
 
@@ -94,19 +93,15 @@ class HierStyleModel(SceneModel):
         self.occupancy = Occupancy(config.occupancy_resolution) if effects.on("empty_space") else None
         if self.exposure is not None:
             self.exposure.requires_grad_(False)
-        self.display = Display(Look(config.render_mode, self._configured_mix()))
+        for name in ("strength", "geometry_strength"):
+            if not 0.0 <= (value := getattr(config, name)) <= 1.0:
+                flag = name.replace("_", "-")
+                raise InputError(f"--pipeline.model.{flag} is {value}; give a number from 0 to 1.")
+        self.display = Display(Look(config.render_mode, Mix(config.strength, config.geometry_strength)))
         self.baked = BakedCache(
             lambda style: self.bake(config.bake_resolution, style),
             lambda: [part for part in (self.field, self.space, self.occupancy) if part is not None],
         )
-
-    def _configured_mix(self) -> Mix:
-        config = self.config
-        for name in ("strength", "geometry_strength"):
-            if not 0.0 <= getattr(config, name) <= 1.0:
-                flag = name.replace("_", "-")
-                raise InputError(f"--pipeline.model.{flag} is {getattr(config, name)}; give a number from 0 to 1.")
-        return Mix(config.strength, config.geometry_strength)
 
     def new_style(self) -> StylisedField:
         """A field to be stylised, as it is before training, on the coarse field's device."""
@@ -114,7 +109,6 @@ class HierStyleModel(SceneModel):
         return new.to(next(self.field.parameters()).device)
 
     def _built_for(self) -> torch.device:
-        """The device that the pipeline names when it has the model made."""
         return torch.device(self.kwargs.get("device", "cpu"))
 
     @property
@@ -129,16 +123,11 @@ class HierStyleModel(SceneModel):
 
     @torch.no_grad()
     def adopt_coarse(self, state: Dict[str, Tensor]) -> None:
-        """Takes over a coarse model's field, space and exposures, and finds out which cells are empty.
-
-        Args:
-            state: the state of a `CoarseFewShotModel` with the same settings of the field and of the space.
-        """
+        """Takes over the state of a `CoarseFewShotModel` with these settings, and finds out which cells are empty."""
         for name in ("field", "space", "exposure"):
-            if getattr(self, name) is None:
-                continue
-            part = {key[len(name) + 1 :]: value for key, value in state.items() if key.startswith(name + ".")}
-            getattr(self, name).load_state_dict(part, strict=True)
+            if getattr(self, name) is not None:
+                part = {key[len(name) + 1 :]: value for key, value in state.items() if key.startswith(name + ".")}
+                getattr(self, name).load_state_dict(part, strict=True)
         self.field.to(self.device)
         if isinstance(self.residual, FineTunedField):
             self.residual.field.load_state_dict(self.field.state_dict())
@@ -180,37 +169,20 @@ class HierStyleModel(SceneModel):
     def stylised(
         self, frozen: FrozenSamples, coarse_geometry: bool = False, style: Optional[StylisedField] = None
     ) -> PackedRender:
-        """Renders σ_f, or with `coarse_geometry` σ_c, and c_f at frozen samples; differentiable.
-
-        Args:
-            style: the stylised field; None: the model's own.
-        """
+        """`render_stylised` of a style, by default the model's own."""
         with autocast(self.device, self.config.precision):
             return render_stylised(style or self.residual, frozen, self.background, coarse_geometry)
 
     def bake(self, resolution: int, style: Optional[StylisedField] = None) -> BakedVolume:
-        """The fields, to be kept in a voxel grid; nothing is evaluated before rays are rendered.
-
-        Args:
-            resolution: cells along a side of the cube.
-            style: the stylised field; None: the model's own.
-        """
+        """The fields with a style, by default the model's own, in a voxel grid that is filled as rays are rendered."""
         shade = shade_of(self.field, style or self.residual, self.space, self.config.precision)
         return BakedVolume(shade, resolution, self.device)
 
     def render_baked(
         self, segments: Segments, styles: Tuple[StylisedField, ...], mix: Mix = STYLISED
     ) -> Tuple[PackedRender, PackedRender]:
-        """Renders from voxels a mixture of the fields, and the coarse field; fills in the voxels that are missing."""
+        """Renders a mixture of the fields, and the coarse field, from voxels."""
         return self.baked.render(styles, segments, self.marching, self.background, mix)
-
-    def render_exact(
-        self, ray_bundle: RayBundle, styles: Tuple[StylisedField, ...], mix: Mix
-    ) -> Tuple[PackedRender, PackedRender]:
-        """Renders a mixture of the fields, and the coarse field, by evaluating them at every sample."""
-        frozen = self.freeze(ray_bundle.origins, ray_bundle.directions)
-        with autocast(self.device, self.config.precision):
-            return render_mixed(self.field, styles, frozen, ray_bundle.directions, self.background, mix)
 
     @untraced
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
@@ -221,7 +193,9 @@ class HierStyleModel(SceneModel):
         if look.mode == "baked" and not self.training:
             fine, coarse = self.render_baked(segments, styles, look.mix)
         else:
-            fine, coarse = self.render_exact(ray_bundle, styles, look.mix)
+            frozen, directions = self.freeze(ray_bundle.origins, ray_bundle.directions), ray_bundle.directions
+            with autocast(self.device, self.config.precision):
+                fine, coarse = render_mixed(self.field, styles, frozen, directions, self.background, look.mix)
         return {
             "rgb": fine.rgb,
             "rgb_coarse": coarse.rgb,
@@ -231,15 +205,8 @@ class HierStyleModel(SceneModel):
             "depth_coarse": surface_distance(segments, coarse.s),
         }
 
-    def rendering(self, mode: RenderMode) -> AbstractContextManager[None]:
-        """Within it, pictures are made in this mode, except those for the viewer (see `Display`)."""
-        return self.display.rendering(mode)
-
     def get_rgba_image(self, outputs: Dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """Colour without background, and opacity, for `ns-export tsdf` and ns-render's output rgba.
-
-        Opacity is the stylised geometry's, for `rgb_coarse` too.
-        """
+        """Colour without background, and the stylised geometry's opacity, for `ns-export tsdf` and ns-render's rgba."""
         color = straight_color(outputs[output_name], outputs["accumulation"], self.background)
         return torch.cat([color, outputs["accumulation"]], dim=-1)
 

@@ -16,10 +16,7 @@ class SceneModel(Model):
     """A model of a scene, with its space, its background colour and its photos' exposures.
 
     Args:
-        config: the model's settings.
         scene_box: the dataparser's; in NDC if there is `ndc`, else in the world.
-        num_train_data: training photos.
-        effects: what is simulated.
         ndc: the dataparser's map to NDC, without which space isn't laid out so.
         kwargs: for nerfstudio's model, among them the `device` that it will be moved to.
     """

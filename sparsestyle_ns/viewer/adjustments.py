@@ -13,8 +13,7 @@ def begin_at_central_photo(viewer: Viewer, cameras: Cameras) -> None:
     """Has each new browser look at the scene as its most central photo does."""
     poses = cameras.camera_to_worlds.cpu().double().numpy()
     centre = int(np.argmin(np.linalg.norm(poses[:, :, 3] - poses[:, :, 3].mean(axis=0), axis=-1)))
-    pose = poses[centre]
-    position = VISER_NERFSTUDIO_SCALE_RATIO * pose[:, 3]
+    pose, position = poses[centre], VISER_NERFSTUDIO_SCALE_RATIO * poses[centre, :, 3]
 
     def welcome(client: ClientHandle) -> None:
         with client.atomic():

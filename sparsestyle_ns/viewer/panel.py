@@ -45,9 +45,6 @@ class StylePanel(ViewerControl):
 
     Controls change what the viewer's threads draw and nothing else: what is drawn in training and for evaluation, files
     and videos is what the run's config says.
-
-    Args:
-        pipeline: of the run.
     """
 
     def __init__(self, pipeline: HierStylePipeline) -> None:
@@ -58,13 +55,12 @@ class StylePanel(ViewerControl):
         self._pace = Pace()
         self._knows_training = False
 
-    # Making the panel
-
     def _setup(self, viewer: Viewer) -> None:
-        """Called by nerfstudio when everything else of the viewer is there; see `ViewerControl`."""
         super()._setup(viewer)
         self.folder = Path(viewer.log_filename).parent.resolve()
-        self._name_own_style()
+        painting = self.pipeline.config.style_image
+        name = free_name("this run" if painting is None else painting.stem, [NO_BLEND])
+        self.styles = [Style(name, self.pipeline.model.residual)]
         # After nerfstudio's buttons and step, before its tabs.
         with viewer.viser_server.gui.add_folder("Style", order=viewer.stats_markdown.order + 0.5):
             self._add_controls()
@@ -131,13 +127,6 @@ class StylePanel(ViewerControl):
         """The lock that iterations of training and the viewer's pictures take turns by."""
         return nullcontext() if self.viewer.train_lock is None else self.viewer.train_lock
 
-    # Styles
-
-    def _name_own_style(self) -> None:
-        painting = self.pipeline.config.style_image
-        name = self._free_name("this run" if painting is None else painting.stem)
-        self.styles = [Style(name, self.pipeline.model.residual)]
-
     def describe_run(self) -> None:
         """Says what made the run's own style, as far as it is known by now."""
         painting, trainer = self.pipeline.config.style_image, self.viewer.trainer
@@ -153,7 +142,7 @@ class StylePanel(ViewerControl):
 
     def add_style(self, name: str, field: StylisedField, facts: Facts, thumbnail: bytes) -> str:
         """Adds a style and chooses it; returns its name, which may have got a number to tell it from the others."""
-        name = self._free_name(name)
+        name = free_name(name, [NO_BLEND, *(style.name for style in self.styles)])
         with self._lock():
             self.styles.append(Style(name, field, facts, thumbnail))
         self.offer_styles(name)
@@ -166,24 +155,17 @@ class StylePanel(ViewerControl):
         self.other.options = [NO_BLEND, *names]
         self.style.value = chosen
 
-    def _free_name(self, name: str) -> str:
-        """A name by which a new style can be told from the others and from none."""
-        return free_name(name, [NO_BLEND, *(style.name for style in self.styles)])
-
     def _named(self, name: str) -> Optional[Style]:
         return next((style for style in self.styles if style.name == name), None)
 
     def _chosen(self) -> Style:
         return self._named(self.style.value) or self.styles[0]
 
-    # What is drawn
-
     def look(self) -> Optional[Look]:
         """What the controls say, to the viewer's own threads; None to all others."""
         if not isinstance(threading.current_thread(), RenderStateMachine):
             return None
-        mix = Mix(self.strength.value, self.geometry.value, self.blend.value)
-        return Look(self.mode.value, mix, self.shown())
+        return Look(self.mode.value, Mix(self.strength.value, self.geometry.value, self.blend.value), self.shown())
 
     def shown(self) -> Tuple[StylisedField, ...]:
         """The fields of the style and of the one that it is blended with."""
@@ -205,11 +187,10 @@ class StylePanel(ViewerControl):
     def apply_split(self) -> None:
         """Shows the coarse field on the left and the stylised one on the right, or the stylised one alone."""
         panel = self.viewer.control_panel
-        outputs = ("rgb_coarse", "rgb") if self.split.value else ("rgb", "rgb_coarse")
+        left, right = ("rgb_coarse", "rgb") if self.split.value else ("rgb", "rgb_coarse")
         if self.split.value or panel._split.value:
-            panel._output_render.value, panel._split_output_render.value = outputs
-        else:
-            panel._split_output_render.value = outputs[1]
+            panel._output_render.value = left
+        panel._split_output_render.value = right
         panel._split.value = self.split.value
 
     def seconds_at_rest(self) -> float:
@@ -218,12 +199,11 @@ class StylePanel(ViewerControl):
 
     def _is_free(self) -> bool:
         """Whether volumes may be filled ahead."""
+        if self.mode.value != "baked" or self.restyling.is_busy:
+            return False
         trainer = self.viewer.trainer
-        trains = trainer is not None and trainer.training_state != "completed"
-        idle = not self.restyling.is_busy and self.seconds_at_rest() > SECONDS_UNTIL_BAKING
-        return self.mode.value == "baked" and idle and not trains
-
-    # Training
+        is_over = trainer is None or trainer.training_state == "completed"
+        return is_over and self.seconds_at_rest() > SECONDS_UNTIL_BAKING
 
     def show_losses(self, step: int, losses: Losses) -> None:
         """Tells of an iteration of training."""
@@ -231,8 +211,7 @@ class StylePanel(ViewerControl):
         if not self._pace.is_due(at_once=step + 1 == total):
             return
         if not self._knows_training:
-            self._knows_training = True
+            self._knows_training = self.training.visible = True
             self.describe_run()
-            self.training.visible = True
         values = {name: float(value) for name, value in losses.metrics().items()}
         self.training.content = f"Iteration {step + 1} of {total}: {losses_text(values)}"

@@ -14,8 +14,9 @@ from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
 from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.progress import duration
 from sparsestyle_ns.viewer.styles import Facts, style_facts
-from sparsestyle_ns.viewer.texts import error_text, in_one_line, losses_text, minutes, plain
+from sparsestyle_ns.viewer.texts import error_text, in_one_line, losses_text, plain
 
 SECONDS_BETWEEN_TEXTS = 0.5
 """Losses and progress are not told more often than this."""
@@ -46,10 +47,9 @@ class RestylingControls:
 
     Args:
         gui: where the controls are added, in the folder that is open.
-        open_workshop: the scene's workshop, or an `InputError` that says why it can't be restyled.
+        open_workshop: gives the scene's workshop; raises an `InputError` that says why it can't be restyled.
         is_prepared: whether the scene is ready, which it isn't while training is being set up.
         seconds_at_rest: since a camera or a control was moved.
-        add_style: shows a new style.
     """
 
     def __init__(
@@ -92,17 +92,18 @@ class RestylingControls:
 
     def restyle_path(self) -> None:
         """Restyles with the picture whose path was written."""
-        self._restyle(self._read_path)
+
+        def read() -> Painting:
+            path = self.path.value.strip()
+            if not path:
+                raise InputError("There is no image: write a path, or upload one.")
+            return Painting.read(path)
+
+        self._restyle(read)
 
     def restyle_upload(self, name: str, data: bytes) -> None:
         """Restyles with a picture that a browser sent."""
         self._restyle(lambda: Painting.received(name, data))
-
-    def _read_path(self) -> Painting:
-        path = self.path.value.strip()
-        if not path:
-            raise InputError("There is no image: write a path, or upload one.")
-        return Painting.read(path)
 
     def _restyle(self, read: Callable[[], Painting]) -> None:
         """Starts a restyling, or says why not."""
@@ -110,7 +111,12 @@ class RestylingControls:
             self.message.content = "One restyling at a time: wait for it, or stop it."
             return
         try:
-            restyling = self._new_restyling(read())
+            painting = read()
+            if self.workshop is None:
+                raise InputError("This run can't be restyled in this viewer.")
+            if not self.is_prepared():
+                raise InputError("The scene is still being prepared for training; try again when it has begun.")
+            restyling = Restyling(self.workshop, painting, int(self.iterations.value))
         except Exception as error:  # whatever it is, the viewer goes on
             self._busy.release()
             self.end(f"**Not restyled.** {plain(error_text(error))}")
@@ -119,13 +125,6 @@ class RestylingControls:
         self.stop_button.visible = True
         self.thread = threading.Thread(target=self._work, args=(restyling,), name="restyling", daemon=True)
         self.thread.start()
-
-    def _new_restyling(self, painting: Painting) -> Restyling:
-        if self.workshop is None:
-            raise InputError("This run can't be restyled in this viewer.")
-        if not self.is_prepared():
-            raise InputError("The scene is still being prepared for training; try again when it has begun.")
-        return Restyling(self.workshop, painting, int(self.iterations.value))
 
     def _work(self, restyling: Restyling) -> None:
         """Stylises, then shows what came out; the thread of one restyling."""
@@ -175,7 +174,7 @@ class RestylingControls:
         self.bar.visible, self.bar.value = True, 100.0 * progress.done
         text = f"Restyling. {progress.words}"
         if progress.losses is not None:
-            text += f": {losses_text(progress.losses)}, {minutes(progress.seconds_left)} left"
+            text += f": {losses_text(progress.losses)}, {duration(progress.seconds_left)} left"
         self.message.content = text
 
     def end(self, message: str) -> None:

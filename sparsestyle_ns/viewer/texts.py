@@ -3,7 +3,6 @@
 import re
 from typing import Dict
 
-from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.utils.errors import InputError
 
 
@@ -16,22 +15,9 @@ def plain(text: str) -> str:
     return re.sub(r"(/|\\_)", r"\1<wbr />", escaped)
 
 
-def effects_text(effects: Decisions) -> str:
-    """Each effect in a line; a table would be wider than the panel."""
-    return "\n\n".join(
-        f"**{plain(name)}** {state}: {measured} {plain(why)} (threshold {threshold})"
-        for name, state, measured, threshold, why in (item.cells() for item in effects.items)
-    )
-
-
 def losses_text(losses: Dict[str, float]) -> str:
     """Losses and weights by name, in a line."""
     return ", ".join(f"{name} {value:.3g}" for name, value in losses.items())
-
-
-def minutes(seconds: float) -> str:
-    """A time as m:ss."""
-    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
 def error_text(error: Exception) -> str:

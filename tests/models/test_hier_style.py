@@ -213,7 +213,7 @@ def test_the_hash_grid_is_tiny_cuda_nns_on_a_gpu_where_it_is_installed_and_the_c
 
 
 def test_a_picture_in_one_mode_leaves_the_models_own_as_it_was(model):
-    with pytest.raises(RuntimeError), model.rendering("exact"):
+    with pytest.raises(RuntimeError), model.display.rendering("exact"):
         assert model.display.look.mode == "exact"
         raise RuntimeError
     assert model.display.look.mode == "baked"

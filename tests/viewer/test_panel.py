@@ -329,7 +329,7 @@ def test_restyling_gives_a_style_that_blends_and_a_run_that_renders(
     _, pipeline, step = load_run(saved / "config.yml")
     assert step == 2 and pipeline.config.style_image.read_bytes() == png(3)
     camera = pipeline.datamanager.train_dataset.cameras[:1]
-    with pipeline.model.rendering("baked"):
+    with pipeline.model.display.rendering("baked"):
         assert torch.equal(pipeline.model.get_outputs_for_camera(camera)["rgb"], second)
     render(saved, tmp_path / "pictures")
     assert len(list((tmp_path / "pictures").rglob("*.jpg"))) == 1
@@ -472,7 +472,7 @@ def test_a_restyling_sees_exact_views_between_the_photos_also_of_a_run_that_is_s
     (camera,) = cameras_between(pipeline.datamanager.train_dataset.cameras, 1)
     with torch.no_grad():
         exact = pipeline.model.get_outputs_for_camera(camera)["rgb_coarse"]
-        with pipeline.model.rendering("baked"):
+        with pipeline.model.display.rendering("baked"):
             assert not torch.equal(pipeline.model.get_outputs_for_camera(camera)["rgb_coarse"], exact)
             assert torch.equal(pipeline.freeze_views().views[-1].picture, exact)
 
