@@ -180,4 +180,5 @@ class RestylingControls:
     def end(self, message: str) -> None:
         """Says how a restyling ended."""
         self.message.content = message
+        self.bar.value = 0.0
         self.bar.visible = self.stop_button.visible = False
