@@ -41,8 +41,7 @@ class GridLocation(NamedTuple):
     @property
     def num_bytes(self) -> int:
         """Memory that the location takes."""
-        parts = (self.positions, *(self.corners or ()))
-        return sum(part.numel() * part.element_size() for part in parts)
+        return sum(part.nbytes for part in (self.positions, *(self.corners or ())))
 
 
 def grid_resolutions(num_levels: int, min_resolution: int, max_resolution: int) -> Tuple[int, ...]:

@@ -17,21 +17,12 @@ from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.fields.fine import FineFieldConfig, FineTunedField, StylisedField
 from sparsestyle_ns.metrics.image import image_metrics
 from sparsestyle_ns.models.scene_model import SceneModel
-from sparsestyle_ns.rendering.baked import BakedVolume, shade_of
-from sparsestyle_ns.rendering.baked_cache import BakedCache
+from sparsestyle_ns.rendering import render
+from sparsestyle_ns.rendering.baked import BakedCache, BakedVolume, shade_of
 from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
 from sparsestyle_ns.rendering.look import Display, Look, RenderMode
 from sparsestyle_ns.rendering.mixing import STYLISED, Mix
-from sparsestyle_ns.rendering.render import (
-    POINTS_PER_CALL,
-    FrozenSamples,
-    PackedRender,
-    freeze_samples,
-    render_mixed,
-    render_stylised,
-    straight_color,
-    surface_distance,
-)
+from sparsestyle_ns.rendering.render import FrozenSamples, PackedRender, straight_color, surface_distance
 from sparsestyle_ns.rendering.visible_samples import Marching
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.numba_kernels import untraced
@@ -141,12 +132,14 @@ class HierStyleModel(SceneModel):
                 finding.advance(len(points))
                 return values
 
-            self.occupancy.measure(density, self.config.min_alpha, POINTS_PER_CALL)
+            self.occupancy.measure(density, self.config.min_alpha, render.POINTS_PER_CALL)
 
     def freeze(self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]) -> FrozenSamples:
         """The samples of rays that can show, with the coarse field evaluated there."""
         with autocast(self.device, self.config.precision):
-            return freeze_samples(self.field, self.residual, self.space.segments(origins, directions), self.marching)
+            return render.freeze_samples(
+                self.field, self.residual, self.space.segments(origins, directions), self.marching
+            )
 
     def freeze_view(
         self,
@@ -156,22 +149,20 @@ class HierStyleModel(SceneModel):
         keep_bytes: float,
     ) -> FrozenView:
         """A view for whole-image steps, in chunks of at most `samples_per_chunk` samples (see `FrozenView`)."""
-        parts = zip(origins.split(RAYS_PER_CALL), directions.split(RAYS_PER_CALL), strict=True)
-        counts = torch.cat([self._count_samples(*rays) for rays in parts])
-        runs = split_by_samples(counts, samples_per_chunk)
+        counts = []
+        for part in zip(origins.split(RAYS_PER_CALL), directions.split(RAYS_PER_CALL), strict=True):
+            segments = self.space.segments(*part)
+            samples = march(segments, self.occupancy, self.config.num_steps, self.space.unbounded)
+            counts.append(torch.bincount(samples.ray_indices, minlength=len(segments.hit)))
+        runs = split_by_samples(torch.cat(counts), samples_per_chunk)
         return FrozenView(runs, lambda run: self.freeze(origins[run], directions[run]), keep_bytes)
-
-    def _count_samples(self, origins: Tensor, directions: Tensor) -> Tensor:
-        segments = self.space.segments(origins, directions)
-        samples = march(segments, self.occupancy, self.config.num_steps, self.space.unbounded)
-        return torch.bincount(samples.ray_indices, minlength=len(origins))
 
     def stylised(
         self, frozen: FrozenSamples, coarse_geometry: bool = False, style: Optional[StylisedField] = None
     ) -> PackedRender:
         """`render_stylised` of a style, by default the model's own."""
         with autocast(self.device, self.config.precision):
-            return render_stylised(style or self.residual, frozen, self.background, coarse_geometry)
+            return render.render_stylised(style or self.residual, frozen, self.background, coarse_geometry)
 
     def bake(self, resolution: int, style: Optional[StylisedField] = None) -> BakedVolume:
         """The fields with a style, by default the model's own, in a voxel grid that is filled as rays are rendered."""
@@ -195,7 +186,7 @@ class HierStyleModel(SceneModel):
         else:
             frozen, directions = self.freeze(ray_bundle.origins, ray_bundle.directions), ray_bundle.directions
             with autocast(self.device, self.config.precision):
-                fine, coarse = render_mixed(self.field, styles, frozen, directions, self.background, look.mix)
+                fine, coarse = render.render_mixed(self.field, styles, frozen, directions, self.background, look.mix)
         return {
             "rgb": fine.rgb,
             "rgb_coarse": coarse.rgb,

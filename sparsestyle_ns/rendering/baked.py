@@ -1,9 +1,8 @@
 """Baked rendering: the two fields kept in a voxel grid of the cube, which is filled where rays come by.
 
-σ_f, c_f and σ_c depend on the position alone, so that a value worked out for one picture serves all others. The first
-picture of a scene takes as long as an exact one, later ones what looking values up takes, whatever mixture of the
-fields they show (`mixing`). Samples, empty cells and early stops are those of the exact render (`freeze_samples`,
-`render_mixed`); what differs is that values between voxels are interpolated.
+σ_f, c_f and σ_c depend on the position alone, so that a value worked out for one picture serves all others, whatever
+mixture of the fields they show (`mixing`). Samples, empty cells and early stops are those of the exact render
+(`freeze_samples`, `render_mixed`); what differs is that values between voxels are interpolated.
 
 A value takes a byte. Densities are kept as their logarithm, and interpolated so: they are exponentials of a smooth
 function, and their error then shows hardly beside that of the colours (fern, 256³ voxels: 42.2 dB against the exact
@@ -11,12 +10,13 @@ picture with logarithms, 40.2 dB with densities; bytes instead of floats cost 0.
 """
 
 import math
-from typing import Callable, Optional, Tuple
+import threading
+from typing import Callable, Dict, Iterable, List, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
-from torch import Tensor
+from torch import Tensor, nn
 
 from sparsestyle_ns.core import spaces
 from sparsestyle_ns.core.occupancy import Occupancy
@@ -51,6 +51,8 @@ makes anything else opaque)."""
 AHEAD = ((0.0, 0.0, -1.0),)
 """Where cameras of a forward-facing scene look."""
 ALL_AROUND = ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
+MOST_BAKED = 4
+"""Styles whose volumes are kept."""
 RAYS_PER_PART = 512
 """Rays that a thread marches before it takes the next part: they end early or late, and threads shouldn't wait."""
 
@@ -155,19 +157,18 @@ class BakedVolume:
         slots = torch.arange(first, self.num_slots, dtype=torch.int32, device=self.slots.device)
         self.slots.view(-1)[bricks] = slots
 
-    def values(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points 8"]:
-        """What `shade` gives, interpolated, with what is missing filled in first."""
+    def density_and_feature(
+        self, positions: Float[Tensor, "points 3"]
+    ) -> Tuple[Float[Tensor, "points"], Float[Tensor, "points 7"]]:
+        """σ_c, and all else that `shade` gives as the feature, interpolated, with what is missing filled in first.
+
+        So it is a coarse field as far as `visible_samples` is concerned.
+        """
         lower, fraction = self.cells(positions)
         self.fill(lower)
         near = torch.where(self._offsets.bool(), fraction[:, None], 1.0 - fraction[:, None])
         codes = self.codes.view(-1, 8)[self.rows(lower[:, None] + self._offsets)]
-        return decode((near.prod(dim=-1)[..., None] * codes).sum(dim=1))
-
-    def density_and_feature(
-        self, positions: Float[Tensor, "points 3"]
-    ) -> Tuple[Float[Tensor, "points"], Float[Tensor, "points 7"]]:
-        """σ_c, and all others as the feature: a coarse field as far as `visible_samples` is concerned."""
-        values = self.values(positions)
+        values = decode((near.prod(dim=-1)[..., None] * codes).sum(dim=1))
         return values[:, 0], values[:, 1:]
 
 
@@ -185,34 +186,21 @@ ONE_CELL = np.ones((1, 1, 1), dtype=bool)
 
 @torch.no_grad()
 def render_baked(
-    volume: BakedVolume,
-    segments: Segments,
-    marching: Marching,
-    background: Background,
-    mix: Mix = STYLISED,
-    second: Optional[BakedVolume] = None,
+    volumes: Sequence[BakedVolume], segments: Segments, marching: Marching, background: Background, mix: Mix = STYLISED
 ) -> Tuple[PackedRender, PackedRender]:
-    """The render of a mixture of the fields, by default the stylised one, and the coarse render.
-
-    `second` is of another style, with the same coarse field and resolution.
-    """
-    march = march_compiled if volume.codes.device.type == "cpu" else march_in_torch
-    return march(volume, segments, marching, background, mix, second)
+    """The render of a mixture of one or two styles, which share coarse field and resolution, and the coarse render."""
+    march = march_compiled if volumes[0].codes.device.type == "cpu" else march_in_torch
+    return march(volumes, segments, marching, background, mix)
 
 
 @torch.no_grad()
 def march_in_torch(
-    volume: BakedVolume,
-    segments: Segments,
-    marching: Marching,
-    background: Background,
-    mix: Mix = STYLISED,
-    second: Optional[BakedVolume] = None,
+    volumes: Sequence[BakedVolume], segments: Segments, marching: Marching, background: Background, mix: Mix = STYLISED
 ) -> Tuple[PackedRender, PackedRender]:
     """`render_baked` on any device: the exact render, with the volumes in the fields' place."""
-    samples, density, values = visible_samples(volume, segments, marching)
-    both = [values] if second is None else [values, second.density_and_feature(samples.positions)[1]]
-    coarse, styles = Appearance(density, values[:, 4:]), [Appearance(each[:, 0], each[:, 1:4]) for each in both]
+    samples, density, values = visible_samples(volumes[0], segments, marching)
+    found = [values, *(volume.density_and_feature(samples.positions)[1] for volume in volumes[1:])]
+    coarse, styles = Appearance(density, values[:, 4:]), [Appearance(each[:, 0], each[:, 1:4]) for each in found]
     num_rays = len(segments.hit)
     render = render_packed(samples, num_rays, *mixed(coarse, styles, mix), background)
     return render, render_packed(samples, num_rays, *coarse, background)
@@ -220,19 +208,13 @@ def march_in_torch(
 
 @torch.no_grad()
 def march_compiled(
-    volume: BakedVolume,
-    segments: Segments,
-    marching: Marching,
-    background: Background,
-    mix: Mix = STYLISED,
-    second: Optional[BakedVolume] = None,
+    volumes: Sequence[BakedVolume], segments: Segments, marching: Marching, background: Background, mix: Mix = STYLISED
 ) -> Tuple[PackedRender, PackedRender]:
     """`render_baked` on a CPU: rays are marched until none has come by a voxel that isn't filled."""
     lines = _lines(segments, marching)
     left = torch.arange(len(lines.hit))
     sums = torch.zeros(len(left), 10)
     shares = tuple(map(np.float32, (mix.density_share, mix.strength, mix.blend)))
-    volumes = [volume] if second is None else [volume, second]
     while len(left):
         missing = torch.full((len(left), baked_kernels.LOOKAHEAD), baked_kernels.NO_CELL)
         voxels = (*(_voxels(each, marching.occupancy) for each in volumes), None)[:2]
@@ -242,7 +224,7 @@ def march_compiled(
         found = missing != baked_kernels.NO_CELL
         left = left[found[:, 0]]
         for each in volumes if len(left) else []:
-            each.fill(_unravel(missing[found], volume.resolution))
+            each.fill(_unravel(missing[found], each.resolution))
     return composite(sums[:, :5], background), composite(sums[:, 5:], background)
 
 
@@ -276,3 +258,56 @@ def _lines(segments: Segments, marching: Marching) -> baked_kernels.Lines:
         spaced=spaced.numpy(),
         edges=even_edges(1, marching.num_steps, segments.hit.device)[0].numpy(),
     )
+
+
+class BakedCache:
+    """Keeps a baked volume for each of the styles that were shown last, for as long as no weight in it changes.
+
+    Any number of threads may render: they take turns.
+
+    Args:
+        bake: makes a style's volume, with nothing in it yet.
+        shared: gives the modules that the pictures of all styles depend on.
+    """
+
+    def __init__(self, bake: Callable[[StylisedField], BakedVolume], shared: Callable[[], Iterable[nn.Module]]) -> None:
+        self._bake, self._shared = bake, shared
+        self.volumes: Dict[StylisedField, Tuple[BakedVolume, List[Tensor]]] = {}
+        """By style, the volume and the weights that it was made of; the style that was shown last comes last."""
+        self._lock = threading.Lock()  # volumes grow while they are rendered, and a viewer has several threads
+
+    def render(
+        self,
+        styles: Sequence[StylisedField],
+        segments: Segments,
+        marching: Marching,
+        background: Background,
+        mix: Mix = STYLISED,
+    ) -> Tuple[PackedRender, PackedRender]:
+        """`render_baked` of one or two styles; what these rays need and the volumes don't have yet is filled in."""
+        with self._lock:
+            return render_baked(list(map(self._current, styles)), segments, marching, background, mix)
+
+    def kept(self, style: StylisedField) -> Optional[BakedVolume]:
+        """The volume of a style's next picture; None where it would start a new one, as when weights have changed."""
+        volume, known = self.volumes.get(style, (None, []))
+        return volume if volume is not None and all(map(torch.equal, known, self._weights(style))) else None
+
+    def _current(self, style: StylisedField) -> BakedVolume:
+        """A style's volume, a new one if what it shows has changed since the last picture."""
+        weights, volume = self._weights(style), self.kept(style) or self._bake(style)
+        # The viewer may break a picture off between any two lines; here that loses nothing.
+        others = {each: kept for each, kept in self.volumes.items() if each is not style}
+        self.volumes = dict([*others.items(), (style, (volume, weights))][-MOST_BAKED:])
+        return volume
+
+    def _weights(self, style: StylisedField) -> List[Tensor]:
+        """What changes with every change of the weights that a style's pictures show, and is quick to compare.
+
+        torch counts the changes of each tensor, but not those that fused optimisers make; these change every parameter
+        of the residual MLP.
+        """
+        tensors = [tensor for part in (*self._shared(), style) for tensor in (*part.parameters(), *part.buffers())]
+        versions = torch.tensor([(tensor.data_ptr(), tensor._version) for tensor in tensors])
+        values = [parameter for name, parameter in style.named_parameters() if not name.startswith("grid")]
+        return [versions, torch.cat([value.detach().flatten() for value in values])]

@@ -117,8 +117,7 @@ class FrozenSamples:
     @property
     def num_bytes(self) -> int:
         """Memory that keeping these samples takes."""
-        parts = [*self.samples, self.density, self.feature]
-        return sum(part.numel() * part.element_size() for part in parts) + self.location.num_bytes
+        return sum(part.nbytes for part in (*self.samples, self.density, self.feature)) + self.location.num_bytes
 
 
 @torch.no_grad()

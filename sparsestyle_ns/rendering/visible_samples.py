@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import List, Optional, Protocol, Tuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from sparsestyle_ns.core.occupancy import Occupancy, PackedSamples, march
@@ -43,29 +43,18 @@ def visible_samples(
 ) -> Tuple[PackedSamples, Float[Tensor, "samples"], Float[Tensor, "samples feature"]]:
     """The samples of a batch of rays that can show, and σ_c and e_c there.
 
-    They lie in occupied cells, and more than `min_transmittance` of the light is left in front of them.
+    They lie in occupied cells, and more than `min_transmittance` of the light is left in front of them. The result is
+    the same each time, on a GPU too: a view that is frozen again in the backward pass must have the same samples. So no
+    depths are summed by atomic additions, as `index_add_` and long running sums do there.
     """
     samples = march(segments, marching.occupancy, marching.num_steps, marching.unbounded)
-    index, density, feature = evaluate_front_to_back(field, samples, len(segments.hit), marching.min_transmittance)
-    return samples.select(index), density, feature
-
-
-def evaluate_front_to_back(
-    field: DensityField, samples: PackedSamples, num_rays: int, min_transmittance: float
-) -> Tuple[Int[Tensor, "seen"], Float[Tensor, "seen"], Float[Tensor, "seen feature"]]:
-    """σ_c and e_c of those packed samples in front of which more than `min_transmittance` of the light is left.
-
-    They come with their ascending indices. The result is the same each time, on a GPU too: a view that is frozen again
-    in the backward pass must have the same samples. So no depths are summed by atomic additions, as `index_add_` and
-    long running sums do there.
-    """
-    on_ray = samples.ray_indices
+    on_ray, num_rays = samples.ray_indices, len(segments.hit)
     counts = torch.bincount(on_ray, minlength=num_rays)
     rank = torch.arange(len(on_ray), device=on_ray.device) - (torch.cumsum(counts, dim=0) - counts)[on_ray]
     depth = samples.s.new_zeros(num_rays)
     found: List[Tuple[Tensor, Tensor, Tensor]] = []
     for first in range(0, max(1, int(counts.max())), SAMPLES_PER_PASS):
-        goes_on = torch.exp(-depth) > min_transmittance
+        goes_on = torch.exp(-depth) > marching.min_transmittance
         in_pass = (rank >= first) & (rank < first + SAMPLES_PER_PASS) & goes_on[on_ray]
         index = in_pass.nonzero().squeeze(-1)
         density, feature = field.density_and_feature(samples.positions[index])
@@ -74,9 +63,9 @@ def evaluate_front_to_back(
         depths[place] = optical_depth(density, samples.lengths[index])
         behind = depth[:, None] + depths.cumsum(dim=1)
         in_front = torch.cat([depth[:, None], behind[:, :-1]], dim=1)
-        seen = torch.exp(-in_front)[place] > min_transmittance
+        seen = torch.exp(-in_front)[place] > marching.min_transmittance
         depth = behind[:, -1]
         found.append((index[seen], density[seen], feature[seen].float()))
     index, density, feature = (torch.cat(parts) for parts in zip(*found, strict=True))
     order = torch.argsort(index)
-    return index[order], density[order], feature[order]
+    return samples.select(index[order]), density[order], feature[order]

@@ -258,7 +258,7 @@ def _measure_baking(bench: Workbench, curve: Curve, budget: Budget) -> None:
             if resolution is None:
                 return bench.picture(model.get_outputs(rays))
             segments = model.space.segments(rays.origins, rays.directions)
-            fine, coarse = render_baked(volumes[resolution], segments, model.marching, model.background)
+            fine, coarse = render_baked([volumes[resolution]], segments, model.marching, model.background)
             return fine.rgb if bench.is_stylised else coarse.rgb
 
         at = frame % len(flight)

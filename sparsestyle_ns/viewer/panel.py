@@ -1,4 +1,4 @@
-"""The "Style" panel of `hier-style` in nerfstudio's viewer, in ns-train and ns-viewer alike."""
+"""Our part of nerfstudio's viewer: a panel of the style for `hier-style`, and of the effects for both methods."""
 
 import atexit
 import threading
@@ -15,6 +15,7 @@ from nerfstudio.viewer.viewer_elements import ViewerControl
 from sparsestyle_ns.engine.restyling import Workshop
 from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.losses.stylization import Losses
+from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
 from sparsestyle_ns.rendering.look import RENDER_MODES, Look
 from sparsestyle_ns.rendering.mixing import Mix
@@ -23,10 +24,8 @@ from sparsestyle_ns.runs.thumbnail import find_thumbnail
 from sparsestyle_ns.utils.names import free_name
 from sparsestyle_ns.viewer.adjustments import begin_at_central_photo, hide_frustums, keep_outputs
 from sparsestyle_ns.viewer.baking import Baker
-from sparsestyle_ns.viewer.effects_panel import add_effects
-from sparsestyle_ns.viewer.restyling_controls import Pace, RestylingControls
-from sparsestyle_ns.viewer.styles import Facts, Style, saved_notes, style_facts
-from sparsestyle_ns.viewer.texts import losses_text
+from sparsestyle_ns.viewer.restyling_controls import Pace, RestylingControls, losses_text
+from sparsestyle_ns.viewer.styles import Facts, Style, plain, saved_notes, style_facts
 
 NO_BLEND = "nothing"
 """What a style is blended with at first; no style has this name."""
@@ -49,7 +48,6 @@ class StylePanel(ViewerControl):
 
     def __init__(self, pipeline: HierStylePipeline) -> None:
         self.pipeline = pipeline
-        self.styles: List[Style] = []
         self.baker: Optional[Baker] = None
         self._last_change = 0.0
         self._pace = Pace()
@@ -60,7 +58,7 @@ class StylePanel(ViewerControl):
         self.folder = Path(viewer.log_filename).parent.resolve()
         painting = self.pipeline.config.style_image
         name = free_name("this run" if painting is None else painting.stem, [NO_BLEND])
-        self.styles = [Style(name, self.pipeline.model.residual)]
+        self.styles: List[Style] = [Style(name, self.pipeline.model.residual)]
         # After nerfstudio's buttons and step, before its tabs.
         with viewer.viser_server.gui.add_folder("Style", order=viewer.stats_markdown.order + 0.5):
             self._add_controls()
@@ -93,8 +91,8 @@ class StylePanel(ViewerControl):
         self.split = gui.add_checkbox("Coarse | stylised", False)
         for control in (self.strength, self.geometry, self.blend, self.mode):
             control.on_update(lambda _: self._changed())
-        self.style.on_update(lambda _: self._style_chosen())
-        self.other.on_update(lambda _: self._other_chosen())
+        for control in (self.style, self.other):
+            control.on_update(lambda _: self._style_chosen())
         self.split.on_update(lambda _: self.apply_split())
         self.training = gui.add_markdown("", image_root=Path(), visible=False)
         self.restyling = RestylingControls(
@@ -150,9 +148,8 @@ class StylePanel(ViewerControl):
 
     def offer_styles(self, chosen: str) -> None:
         """Fills the lists with the styles that there are, and chooses one by its name."""
-        names = [style.name for style in self.styles]
-        self.style.options = names
-        self.other.options = [NO_BLEND, *names]
+        self.style.options = [style.name for style in self.styles]
+        self.other.options = [NO_BLEND, *self.style.options]
         self.style.value = chosen
 
     def _named(self, name: str) -> Optional[Style]:
@@ -178,9 +175,6 @@ class StylePanel(ViewerControl):
 
     def _style_chosen(self) -> None:
         self.description.content = self._chosen().markdown()
-        self._changed()
-
-    def _other_chosen(self) -> None:
         self.blend.visible = self.other.value != NO_BLEND
         self._changed()
 
@@ -215,3 +209,26 @@ class StylePanel(ViewerControl):
             self.describe_run()
         values = {name: float(value) for name, value in losses.metrics().items()}
         self.training.content = f"Iteration {step + 1} of {total}: {losses_text(values)}"
+
+
+def add_effects(viewer: Viewer, pipeline: CheckedPipeline) -> None:
+    """Adds a folder that says which effects of a scene are simulated, and why."""
+    lines = [  # a table would be wider than the panel
+        f"**{plain(name)}** {state}: {measured} {plain(why)} (threshold {threshold})"
+        for name, state, measured, threshold, why in (item.cells() for item in pipeline.effects.items)
+    ]
+    gui = viewer.viser_server.gui
+    with gui.add_folder("Effects of this scene", expand_by_default=False):
+        # viser warns where it is given no folder of pictures; there are none here.
+        gui.add_markdown("\n\n".join(lines), image_root=Path())
+
+
+class EffectsPanel(ViewerControl):
+    """The effects of a scene, in a folder of their own."""
+
+    def __init__(self, pipeline: CheckedPipeline) -> None:
+        self.pipeline = pipeline
+
+    def _setup(self, viewer: Viewer) -> None:
+        super()._setup(viewer)
+        add_effects(viewer, self.pipeline)

@@ -4,7 +4,7 @@ import math
 import threading
 import time
 from pathlib import Path
-from typing import Callable, Optional
+from typing import Callable, Dict, Optional
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -15,8 +15,7 @@ from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress import duration
-from sparsestyle_ns.viewer.styles import Facts, style_facts
-from sparsestyle_ns.viewer.texts import error_text, in_one_line, losses_text, plain
+from sparsestyle_ns.viewer.styles import Facts, plain, style_facts
 
 SECONDS_BETWEEN_TEXTS = 0.5
 """Losses and progress are not told more often than this."""
@@ -25,6 +24,24 @@ SECONDS_AT_REST = 0.3
 
 AddStyle = Callable[[str, StylisedField, Facts, bytes], str]
 """Shows a new style, given a name, its field, what made it and its thumbnail; returns the name that it got."""
+
+
+def losses_text(losses: Dict[str, float]) -> str:
+    """Losses and weights by name, in a line."""
+    return ", ".join(f"{name} {value:.3g}" for name, value in losses.items())
+
+
+def error_text(error: Exception) -> str:
+    """An error in one sentence; one that isn't about the user's input keeps its kind."""
+    text = in_one_line(error)
+    if isinstance(error, InputError):
+        return text
+    return f"Something went wrong in restyling, and the style on the screen stays ({type(error).__name__}: {text})."
+
+
+def in_one_line(error: Exception) -> str:
+    """An error's message without line breaks, or its kind where it has none."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 class Pace:

@@ -1,5 +1,6 @@
 """The styles of a scene that a viewer can show: fields, their paintings, and what made them."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import List, Optional, Tuple
@@ -8,10 +9,18 @@ from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, load_checkpoint, newest_checkpoint
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.page import bytes_uri
-from sparsestyle_ns.viewer.texts import plain
 
 Facts = List[Tuple[str, str]]
 """What made a style: pairs of what it is called and what it is."""
+
+
+def plain(text: str) -> str:
+    """Text that Markdown shows as it is, and that may be broken behind slashes and underscores.
+
+    viser's Markdown takes JSX; a panel with a path in it that doesn't fit would have to be scrolled sideways.
+    """
+    escaped = re.sub(r"([\\`*_{}\[\]<>()#+!|~$&])", r"\\\1", " ".join(text.split()))
+    return re.sub(r"(/|\\_)", r"\1<wbr />", escaped)
 
 
 @dataclass(eq=False)

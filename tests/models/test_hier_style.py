@@ -16,7 +16,7 @@ from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid
 from sparsestyle_ns.fields import fine
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.models.hier_style import HierStyleModelConfig
-from sparsestyle_ns.rendering.baked_cache import MOST_BAKED
+from sparsestyle_ns.rendering.baked import MOST_BAKED
 from sparsestyle_ns.rendering.look import Look
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.utils.errors import InputError

@@ -32,13 +32,12 @@ from sparsestyle_ns.export.stylised_scene import load_scene
 from sparsestyle_ns.gallery.make_gallery import collect_run
 from sparsestyle_ns.losses.stylization import Losses
 from sparsestyle_ns.pipelines.scene_views import cameras_between
-from sparsestyle_ns.rendering.baked_cache import MOST_BAKED
+from sparsestyle_ns.rendering.baked import MOST_BAKED
 from sparsestyle_ns.runs.run_folder import find_config
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.viewer.baking import STEPS_BETWEEN
 from sparsestyle_ns.viewer.panel import NO_BLEND, StylePanel
-from sparsestyle_ns.viewer.styles import Style
-from sparsestyle_ns.viewer.texts import plain
+from sparsestyle_ns.viewer.styles import Style, plain
 
 
 class Drawing(RenderStateMachine):
