@@ -1,8 +1,7 @@
 """Multi-resolution hash grid ψ(x) (Sec. 3.1; instant-ngp, Sec. 3): what depends on positions, and what learns.
 
-`HashGrid.locate` prepares points; `HashGrid.interpolate` gathers and sums table rows. Points that stay the same from
-step to step are located once. `locate_corners` and `interpolate` are the readable form in torch, which runs anywhere;
-CPU and CUDA have kernels that do the same in one pass.
+`HashGrid.locate` prepares points, once where they stay the same from step to step. `locate_corners` and `interpolate`
+are the readable form in torch, which runs anywhere; CPU and CUDA have kernels that do the same in one pass.
 """
 
 from importlib.util import find_spec
@@ -89,13 +88,10 @@ def interpolate(table: Float[Tensor, "rows features"], corners: Corners) -> Floa
 
 
 def fused_kernels(device: torch.device) -> Optional[ModuleType]:
-    """The module whose `gather` and `scatter` do the grid's work in one pass on a device; None where there is none.
-
-    Triton comes with torch for CUDA on Linux; where it doesn't, the readable form runs.
-    """
+    """The module whose `gather` and `scatter` do the grid's work in one pass on a device; None where there is none."""
     if device.type == "cpu":
         return hash_grid_kernels
-    if device.type == "cuda" and find_spec("triton") is not None:
+    if device.type == "cuda" and find_spec("triton") is not None:  # it comes with torch for CUDA on Linux
         from sparsestyle_ns.field_components import hash_grid_triton
 
         return hash_grid_triton

@@ -6,12 +6,11 @@ from typing import Any, Dict, List, Optional, Tuple, Type
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
 from sparsestyle_ns.core.occupancy import DensityGrid
-from sparsestyle_ns.core.precision import Precision, autocast
+from sparsestyle_ns.core.precision import autocast
 from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.schedules import ramp
 from sparsestyle_ns.core.spaces import Segments
@@ -19,25 +18,20 @@ from sparsestyle_ns.core.volrend import distortion, effective_samples
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.field_components.positional_encoding import revealed_levels
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
-from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.losses.geometry import matched_depth_loss, near_density
 from sparsestyle_ns.losses.reconstruction import reconstruction_loss
 from sparsestyle_ns.metrics.image import image_metrics, psnr_of_error
-from sparsestyle_ns.models.scene_model import SceneModel
+from sparsestyle_ns.models.scene_model import SceneModel, SceneModelConfig
 from sparsestyle_ns.rendering.render import DenseRender, render_coarse, seen_behind, surface_distance
 from sparsestyle_ns.utils.distributed import gather_rays, num_processes, shard_rays
 from sparsestyle_ns.utils.errors import InputError
 
 
 @dataclass
-class CoarseFewShotModelConfig(ModelConfig):
+class CoarseFewShotModelConfig(SceneModelConfig):
     """Settings of stage 1."""
 
     _target: Type = field(default_factory=lambda: CoarseFewShotModel)
-    enable_collider: bool = False
-    """Unused: the space of the scene decides where rays start and end."""
-    coarse_field: CoarseFieldConfig = field(default_factory=CoarseFieldConfig)
-    """The coarse field."""
     num_samples: int = 24
     """Samples a ray in training."""
     num_eval_samples: int = 64
@@ -65,11 +59,6 @@ class CoarseFewShotModelConfig(ModelConfig):
     """Part of a ray, from its start, that counts as close for the occlusion loss."""
     frequency_reveal: float = 0.0
     """Share of the iterations in which the encoding's octaves are revealed one by one (FreeNeRF); 0 is off."""
-    precision: Precision = "auto"
-    """Number format of matrix products: auto is bfloat16 where the device multiplies it, else float32; tf32 is for
-    GPUs."""
-    eval_num_rays_per_chunk: int = 8192
-    """Rays rendered at once outside of training."""
     seed: int = 42
     """Seed of the jitter of samples; a step's jitter depends on it and the step alone."""
 

@@ -6,22 +6,19 @@ from typing import Any, Dict, List, Optional, Tuple, Type
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
 from sparsestyle_ns.core.occupancy import Occupancy, march
-from sparsestyle_ns.core.precision import Precision, autocast
-from sparsestyle_ns.core.spaces import Segments
-from sparsestyle_ns.fields.coarse import CoarseFieldConfig
+from sparsestyle_ns.core.precision import autocast
 from sparsestyle_ns.fields.fine import FineFieldConfig, FineTunedField, StylisedField
 from sparsestyle_ns.metrics.image import image_metrics
-from sparsestyle_ns.models.scene_model import SceneModel
+from sparsestyle_ns.models.scene_model import SceneModel, SceneModelConfig
 from sparsestyle_ns.rendering import render
 from sparsestyle_ns.rendering.baked import BakedCache, BakedVolume, shade_of
 from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
 from sparsestyle_ns.rendering.look import Display, Look, RenderMode
-from sparsestyle_ns.rendering.mixing import STYLISED, Mix
+from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.rendering.render import FrozenSamples, PackedRender, straight_color, surface_distance
 from sparsestyle_ns.rendering.visible_samples import Marching
 from sparsestyle_ns.utils.errors import InputError
@@ -33,14 +30,10 @@ RAYS_PER_CALL = 1 << 13
 
 
 @dataclass
-class HierStyleModelConfig(FineFieldConfig, ModelConfig):
+class HierStyleModelConfig(FineFieldConfig, SceneModelConfig):
     """Settings of both fields and of how they are rendered."""
 
     _target: Type = field(default_factory=lambda: HierStyleModel)
-    enable_collider: bool = False
-    """Unused: the space of the scene decides where rays start and end."""
-    coarse_field: CoarseFieldConfig = field(default_factory=CoarseFieldConfig)
-    """The coarse field; taken over from the coarse run."""
     num_steps: int = 128
     """Even steps along a ray; those in empty cells are skipped."""
     occupancy_resolution: int = 128
@@ -49,9 +42,6 @@ class HierStyleModelConfig(FineFieldConfig, ModelConfig):
     """Opacity over a cell's side, in (0, 1), below which the coarse field counts as empty there."""
     min_transmittance: float = 1e-3
     """Share of light left, in (0, 1), below which samples farther along the ray are dropped."""
-    precision: Precision = "auto"
-    """Number format of matrix products: auto is bfloat16 where the device multiplies it, else float32; tf32 is for
-    GPUs."""
     render_mode: RenderMode = "exact"
     """How pictures are made outside of training. exact evaluates the fields at every sample. baked reads them from a
     voxel grid that is filled where rays pass: the first picture of a place takes as long as an exact one, later ones a
@@ -65,8 +55,6 @@ class HierStyleModelConfig(FineFieldConfig, ModelConfig):
     bake_resolution: int = 256
     """Cells along the cube's side in baked rendering. Each brick of 8³ that rays have been to takes 4 KiB: at most
     147 MB with 256, 482 MB with 384."""
-    eval_num_rays_per_chunk: int = 8192
-    """Rays rendered at once outside of training."""
 
 
 class HierStyleModel(SceneModel):
@@ -137,9 +125,8 @@ class HierStyleModel(SceneModel):
     def freeze(self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]) -> FrozenSamples:
         """The samples of rays that can show, with the coarse field evaluated there."""
         with autocast(self.device, self.config.precision):
-            return render.freeze_samples(
-                self.field, self.residual, self.space.segments(origins, directions), self.marching
-            )
+            segments = self.space.segments(origins, directions)
+            return render.freeze_samples(self.field, self.residual, segments, self.marching)
 
     def freeze_view(
         self,
@@ -169,12 +156,6 @@ class HierStyleModel(SceneModel):
         shade = shade_of(self.field, style or self.residual, self.space, self.config.precision)
         return BakedVolume(shade, resolution, self.device)
 
-    def render_baked(
-        self, segments: Segments, styles: Tuple[StylisedField, ...], mix: Mix = STYLISED
-    ) -> Tuple[PackedRender, PackedRender]:
-        """Renders a mixture of the fields, and the coarse field, from voxels."""
-        return self.baked.render(styles, segments, self.marching, self.background, mix)
-
     @untraced
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
         """`rgb` (stylised), `accumulation`, `depth` in world units, and the same of the coarse field as `…_coarse`."""
@@ -182,7 +163,7 @@ class HierStyleModel(SceneModel):
         look = self.display.look
         styles = look.styles or (self.residual,)
         if look.mode == "baked" and not self.training:
-            fine, coarse = self.render_baked(segments, styles, look.mix)
+            fine, coarse = self.baked.render(styles, segments, self.marching, self.background, look.mix)
         else:
             frozen, directions = self.freeze(ray_bundle.origins, ray_bundle.directions), ray_bundle.directions
             with autocast(self.device, self.config.precision):

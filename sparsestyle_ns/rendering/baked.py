@@ -48,8 +48,6 @@ DENSITY_STEP = math.log1p(MAX_DENSITY / DENSITY_UNIT) / 254
 ROUNDING = 1e-3
 """Part of a code's step that interpolation may be off; less than that above the code of 0 is 0 (an infinite interval
 makes anything else opaque)."""
-AHEAD = ((0.0, 0.0, -1.0),)
-"""Where cameras of a forward-facing scene look."""
 ALL_AROUND = ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
 MOST_BAKED = 4
 """Styles whose volumes are kept."""
@@ -80,7 +78,7 @@ def shade_of(field: CoarseField, style: StylisedField, space: Space, precision: 
     """
     seen_from = ALL_AROUND
     if field.direction_encoding is None or isinstance(space, spaces.ForwardFacingSpace):
-        seen_from = AHEAD
+        seen_from = ((0.0, 0.0, -1.0),)
 
     def shade(points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 8"]:
         with autocast(points.device, precision):
@@ -118,12 +116,6 @@ class BakedVolume:
         """Memory that it takes now."""
         return self.codes.numel() + 4 * self.slots.numel()
 
-    def cells(self, positions: Float[Tensor, "points 3"]) -> Tuple[Int[Tensor, "points 3"], Float[Tensor, "points 3"]]:
-        """The voxel at the lower corner of each position's cell, and where in its cell a position lies, in [0, 1]."""
-        scaled = (0.5 * positions + 0.5).clamp(0.0, 1.0) * self.resolution
-        lower = scaled.long().clamp(0, self.resolution - 1)
-        return lower, scaled - lower
-
     def rows(self, voxels: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
         """Where the codes of voxels lie."""
         x, y, z = (voxels // SIDE).unbind(-1)
@@ -160,11 +152,10 @@ class BakedVolume:
     def density_and_feature(
         self, positions: Float[Tensor, "points 3"]
     ) -> Tuple[Float[Tensor, "points"], Float[Tensor, "points 7"]]:
-        """σ_c, and all else that `shade` gives as the feature, interpolated, with what is missing filled in first.
-
-        So it is a coarse field as far as `visible_samples` is concerned.
-        """
-        lower, fraction = self.cells(positions)
+        """σ_c, and all else that `shade` gives as the feature, interpolated, with what is missing filled in first."""
+        scaled = (0.5 * positions + 0.5).clamp(0.0, 1.0) * self.resolution
+        lower = scaled.long().clamp(0, self.resolution - 1)
+        fraction = scaled - lower
         self.fill(lower)
         near = torch.where(self._offsets.bool(), fraction[:, None], 1.0 - fraction[:, None])
         codes = self.codes.view(-1, 8)[self.rows(lower[:, None] + self._offsets)]
@@ -180,11 +171,6 @@ def _unravel(index: Int[Tensor, "points"], size: int) -> Int[Tensor, "points 3"]
     return torch.stack([index // size**2, index // size % size, index % size], dim=-1)
 
 
-ONE_CELL = np.ones((1, 1, 1), dtype=bool)
-"""The kernels' grid where nothing is skipped."""
-
-
-@torch.no_grad()
 def render_baked(
     volumes: Sequence[BakedVolume], segments: Segments, marching: Marching, background: Background, mix: Mix = STYLISED
 ) -> Tuple[PackedRender, PackedRender]:
@@ -198,7 +184,7 @@ def march_in_torch(
     volumes: Sequence[BakedVolume], segments: Segments, marching: Marching, background: Background, mix: Mix = STYLISED
 ) -> Tuple[PackedRender, PackedRender]:
     """`render_baked` on any device: the exact render, with the volumes in the fields' place."""
-    samples, density, values = visible_samples(volumes[0], segments, marching)
+    samples, density, values = visible_samples(volumes[0].density_and_feature, segments, marching)
     found = [values, *(volume.density_and_feature(samples.positions)[1] for volume in volumes[1:])]
     coarse, styles = Appearance(density, values[:, 4:]), [Appearance(each[:, 0], each[:, 1:4]) for each in found]
     num_rays = len(segments.hit)
@@ -231,7 +217,7 @@ def march_compiled(
 def _voxels(volume: BakedVolume, occupancy: Optional[Occupancy]) -> baked_kernels.Voxels:
     """A volume in the kernels' form."""
     return baked_kernels.Voxels(
-        ONE_CELL if occupancy is None else occupancy.occupied.numpy(),
+        np.ones((1, 1, 1), dtype=bool) if occupancy is None else occupancy.occupied.numpy(),
         volume.slots.numpy(),
         volume.codes.numpy().view("<u8").squeeze(-1),
         volume.resolution,
@@ -263,11 +249,8 @@ def _lines(segments: Segments, marching: Marching) -> baked_kernels.Lines:
 class BakedCache:
     """Keeps a baked volume for each of the styles that were shown last, for as long as no weight in it changes.
 
-    Any number of threads may render: they take turns.
-
-    Args:
-        bake: makes a style's volume, with nothing in it yet.
-        shared: gives the modules that the pictures of all styles depend on.
+    `bake` makes a style's volume, with nothing in it yet; `shared` gives the modules that the pictures of all styles
+    depend on. Any number of threads may render: they take turns.
     """
 
     def __init__(self, bake: Callable[[StylisedField], BakedVolume], shared: Callable[[], Iterable[nn.Module]]) -> None:
@@ -302,11 +285,8 @@ class BakedCache:
         return volume
 
     def _weights(self, style: StylisedField) -> List[Tensor]:
-        """What changes with every change of the weights that a style's pictures show, and is quick to compare.
-
-        torch counts the changes of each tensor, but not those that fused optimisers make; these change every parameter
-        of the residual MLP.
-        """
+        """What changes with every change of the weights that a style's pictures show, and is quick to compare."""
+        # torch doesn't count the changes that fused optimisers make; these change every parameter of the residual MLP.
         tensors = [tensor for part in (*self._shared(), style) for tensor in (*part.parameters(), *part.buffers())]
         versions = torch.tensor([(tensor.data_ptr(), tensor._version) for tensor in tensors])
         values = [parameter for name, parameter in style.named_parameters() if not name.startswith("grid")]

@@ -30,9 +30,7 @@ def split_by_samples(counts: Int[Tensor, "rays"], max_samples: int) -> List[slic
 class FrozenView:
     """The rays of one view, cut into chunks, with the frozen part of each chunk's work kept or done again each time.
 
-    Args:
-        runs: the rays of each chunk.
-        keep_bytes: memory that kept chunks may take; chunks past it are frozen again whenever they are rendered.
+    Kept chunks take at most `keep_bytes` of memory; those past it are frozen again whenever they are rendered.
     """
 
     def __init__(self, runs: List[slice], freeze: Callable[[slice], FrozenSamples], keep_bytes: float) -> None:
@@ -42,12 +40,11 @@ class FrozenView:
         self.kept_bytes = 0
         for run in runs:
             frozen = freeze(run) if self.kept_bytes < keep_bytes else None
-            if frozen is not None and self.kept_bytes + frozen.num_bytes <= keep_bytes:
-                self.kept_bytes += frozen.num_bytes
-                self.kept.append(frozen)
+            if frozen is None or self.kept_bytes + frozen.num_bytes > keep_bytes:
+                frozen, keep_bytes = None, 0
             else:
-                keep_bytes = 0
-                self.kept.append(None)
+                self.kept_bytes += frozen.num_bytes
+            self.kept.append(frozen)
 
     @property
     def num_chunks(self) -> int:

@@ -8,7 +8,6 @@ from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.rendering.mixing import Mix
 
 RenderMode = Literal["exact", "baked"]
-RENDER_MODES: Tuple[RenderMode, ...] = ("exact", "baked")
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,8 @@ strength s, geometry strength g and blend b of two styles, 0 and 1, shows
     σ = (1 − s g) σ_c + s g [(1 − b) σ_f⁰ + b σ_f¹],      c = (1 − s) c_c + s [(1 − b) c_f⁰ + b c_f¹].
 
 So strength 0 is the coarse field, strength and geometry strength 1 a stylised one, and geometry strength 0 a stylised
-colour on the coarse geometry. What a field of the kind of Eq. 3 adds to the density is σ_f − σ_c, the residual density
-as far as it takes effect; it is that, and not σ' itself, that s g weighs: a negative σ_c + s g σ' can't come up, and
-values that were worked out for one picture serve every other strength.
+colour on the coarse geometry. It is σ_f − σ_c, and not σ' itself, that s g weighs: so σ can't be negative, and values
+that were worked out for one picture serve every other strength.
 """
 
 from typing import NamedTuple, Sequence

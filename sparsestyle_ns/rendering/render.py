@@ -90,10 +90,7 @@ def render_coarse(
     background: Background,
     thinning: Optional[Thinning] = None,
 ) -> DenseRender:
-    """Renders the coarse field with the samples that `edges` bound (Eq. 1; NeRF, Eq. 3).
-
-    `thinning` spares the field's backward pass samples; with None all are in it.
-    """
+    """Renders the coarse field with the samples that `edges` bound (Eq. 1; NeRF, Eq. 3)."""
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
     positions = segments.positions(middle)
     density, feature = field.density_and_feature(positions, thinning)
@@ -125,7 +122,7 @@ def freeze_samples(
     field: CoarseField, stylised: StylisedField, segments: Segments, marching: Marching
 ) -> FrozenSamples:
     """Finds the samples of a batch of rays that can show, and evaluates the frozen coarse field there."""
-    samples, density, feature = visible_samples(field, segments, marching)
+    samples, density, feature = visible_samples(field.density_and_feature, segments, marching)
     return FrozenSamples(samples, density, feature, stylised.locate(samples.positions), len(segments.hit))
 
 
@@ -158,10 +155,7 @@ def composite(sums: Float[Tensor, "rays 5"], background: Background) -> PackedRe
 def render_stylised(
     stylised: StylisedField, frozen: FrozenSamples, background: Background, coarse_geometry: bool = False
 ) -> PackedRender:
-    """Renders σ_f and c_f (Eq. 2 and 3) at frozen samples; differentiable in the stylised field.
-
-    With `coarse_geometry`, σ_c takes the place of σ_f.
-    """
+    """Renders σ_f, or with `coarse_geometry` σ_c, and c_f (Eq. 2 and 3); differentiable in the stylised field."""
     density, color = stylised(frozen.location, frozen.feature, frozen.density)
     if coarse_geometry:
         density = frozen.density

@@ -1,7 +1,7 @@
 """The samples of rays that can show, found by marching through a frozen coarse field."""
 
 from dataclasses import dataclass
-from typing import List, Optional, Protocol, Tuple
+from typing import Callable, List, Optional, Tuple
 
 import torch
 from jaxtyping import Float
@@ -29,17 +29,12 @@ class Marching:
     """Share of light left, in [0, 1), at which a ray ends."""
 
 
-class DensityField(Protocol):
-    """What marching asks of a field."""
-
-    def density_and_feature(
-        self, positions: Float[Tensor, "points 3"]
-    ) -> Tuple[Float[Tensor, "points"], Float[Tensor, "points feature"]]:
-        """σ_c and e_c at field coordinates."""
+DensityAndFeature = Callable[[Float[Tensor, "points 3"]], Tuple[Tensor, Tensor]]
+"""Gives σ_c and e_c at field coordinates."""
 
 
 def visible_samples(
-    field: DensityField, segments: Segments, marching: Marching
+    evaluate: DensityAndFeature, segments: Segments, marching: Marching
 ) -> Tuple[PackedSamples, Float[Tensor, "samples"], Float[Tensor, "samples feature"]]:
     """The samples of a batch of rays that can show, and σ_c and e_c there.
 
@@ -57,7 +52,7 @@ def visible_samples(
         goes_on = torch.exp(-depth) > marching.min_transmittance
         in_pass = (rank >= first) & (rank < first + SAMPLES_PER_PASS) & goes_on[on_ray]
         index = in_pass.nonzero().squeeze(-1)
-        density, feature = field.density_and_feature(samples.positions[index])
+        density, feature = evaluate(samples.positions[index])
         place = on_ray[index], rank[index] - first
         depths = depth.new_zeros(num_rays, SAMPLES_PER_PASS)
         depths[place] = optical_depth(density, samples.lengths[index])

@@ -38,10 +38,7 @@ def hide_frustums(viewer: Viewer) -> None:
 
 
 def keep_outputs(viewer: Viewer, outputs: List[str], choose: Callable[[], None]) -> None:
-    """Offers a model's outputs, and has `choose` pick from them again whenever nerfstudio fills its lists.
-
-    nerfstudio does that for each browser that comes, and forgets what was chosen.
-    """
+    """Offers a model's outputs, and has `choose` pick again when nerfstudio offers its own, as for each new browser."""
     control_panel = viewer.control_panel
     fill = control_panel.update_output_options
 

@@ -1,7 +1,6 @@
 """Baked volumes filled ahead, on a CPU: what cameras near the photos see is there when they come.
 
-A camera that sees a place for the first time waits for the fields to be evaluated there, most of a second on two cores;
-one that sees it again doesn't. So the time in which nobody moves anything goes to places that are likely to be seen.
+A camera that sees a place for the first time waits for the fields to be evaluated there, most of a second on two cores.
 """
 
 import threading
@@ -38,13 +37,9 @@ def likely_cameras(cameras: Cameras) -> List[Cameras]:
 
 
 class Baker(threading.Thread):
-    """Fills the volumes of the styles that are shown, for as long as there is something to fill and time for it.
+    """Fills the volumes of the styles that are shown, while there is something to fill and the processor is free.
 
-    Args:
-        cameras: of the photos.
-        shown: gives the styles on the screen.
-        is_free: whether the processor has nothing else to do.
-        lock: that the viewer's pictures are made under.
+    `cameras` are those of the photos; `lock` is the one that the viewer's pictures are made under.
     """
 
     def __init__(
@@ -103,7 +98,8 @@ class Baker(threading.Thread):
         if self.ending.is_set() or style not in self.shown():
             return None
         with self.lock:
-            self.model.render_baked(self.model.space.segments(origins, directions), (style,))
+            model, segments = self.model, self.model.space.segments(origins, directions)
+            model.baked.render((style,), segments, model.marching, model.background)
             volume = self.model.baked.kept(style)
         time.sleep(0.005)  # whoever waits for the lock gets it
         return volume

@@ -5,7 +5,7 @@ import threading
 import time
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import List, Optional, Tuple
+from typing import List, Optional, Tuple, get_args
 
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
@@ -17,7 +17,7 @@ from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.losses.stylization import Losses
 from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
-from sparsestyle_ns.rendering.look import RENDER_MODES, Look
+from sparsestyle_ns.rendering.look import Look, RenderMode
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes
 from sparsestyle_ns.runs.thumbnail import find_thumbnail
@@ -87,7 +87,7 @@ class StylePanel(ViewerControl):
         self.other = gui.add_dropdown("Blend with", [NO_BLEND, *names])
         self.blend = gui.add_slider("Blend", 0.0, 1.0, 0.01, 0.5, visible=False, hint="0: the style, 1: the other one")
         hint = "baked: quick from a voxel grid, once it has seen a place"
-        self.mode = gui.add_dropdown("Render mode", RENDER_MODES, mode, hint=hint)
+        self.mode = gui.add_dropdown("Render mode", get_args(RenderMode), mode, hint=hint)
         self.split = gui.add_checkbox("Coarse | stylised", False)
         for control in (self.strength, self.geometry, self.blend, self.mode):
             control.on_update(lambda _: self._changed())

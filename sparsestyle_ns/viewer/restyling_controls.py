@@ -62,11 +62,8 @@ class Pace:
 class RestylingControls:
     """An image, buttons and a progress bar; one restyling at a time, in a thread of its own.
 
-    Args:
-        gui: where the controls are added, in the folder that is open.
-        open_workshop: gives the scene's workshop; raises an `InputError` that says why it can't be restyled.
-        is_prepared: whether the scene is ready, which it isn't while training is being set up.
-        seconds_at_rest: since a camera or a control was moved.
+    `open_workshop` raises an `InputError` that says why a scene can't be restyled. `is_prepared` is false while a
+    training is being set up; `seconds_at_rest` count since a camera or a control was moved.
     """
 
     def __init__(
