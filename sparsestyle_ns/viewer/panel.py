@@ -56,9 +56,7 @@ class StylePanel(ViewerControl):
     def _setup(self, viewer: Viewer) -> None:
         super()._setup(viewer)
         self.folder = Path(viewer.log_filename).parent.resolve()
-        painting = self.pipeline.config.style_image
-        name = free_name("this run" if painting is None else painting.stem, [NO_BLEND])
-        self.styles: List[Style] = [Style(name, self.pipeline.model.residual)]
+        self._name_own_style()
         # After nerfstudio's buttons and step, before its tabs.
         with viewer.viser_server.gui.add_folder("Style", order=viewer.stats_markdown.order + 0.5):
             self._add_controls()
@@ -124,6 +122,11 @@ class StylePanel(ViewerControl):
     def _lock(self) -> AbstractContextManager:
         """The lock that iterations of training and the viewer's pictures take turns by."""
         return nullcontext() if self.viewer.train_lock is None else self.viewer.train_lock
+
+    def _name_own_style(self) -> None:
+        painting = self.pipeline.config.style_image
+        name = free_name("this run" if painting is None else painting.stem, [NO_BLEND])
+        self.styles: List[Style] = [Style(name, self.pipeline.model.residual)]
 
     def describe_run(self) -> None:
         """Says what made the run's own style, as far as it is known by now."""
