@@ -117,14 +117,13 @@ def dense_config(scene: Scene, options: Stage1Options) -> Any:
 def vanilla_config(scene: Scene, options: Stage1Options) -> Any:
     """nerfstudio's vanilla-nerf with its own settings (batch, samples, network, optimiser) on the same photos.
 
-    It knows no NDC, so it has the scene as every nerfstudio method would: in the dataparser's world, with the near and
-    far plane at the scene's bounds, which llff-data gives, with the margin that ours have too.
+    Nothing is decided about the scene, so no rays to matched points, which have no colours, are in its batches. It
+    knows no NDC, so it has the scene as every nerfstudio method would: in the dataparser's world, with the near and far
+    plane at the scene's bounds, which llff-data gives, with the margin that ours have too.
     """
     method: TrainerConfig = copy.deepcopy(method_configs["vanilla-nerf"])
     ours = our_config(scene, options).pipeline.datamanager
     ours.train_num_rays_per_batch = 32 if options.quick else method.pipeline.datamanager.train_num_rays_per_batch
-    # Rays to matched points have no colours, and this method knows of nothing else.
-    ours.effects = EffectSettings(matched_depth="off")
     method.pipeline.datamanager = ours
     near, far = load_photos(scene).scene.ndc.depth_range
     method.pipeline.model.collider_params = {"near_plane": near, "far_plane": far}
@@ -151,6 +150,7 @@ def make_training(name: str, scene: Scene, options: Stage1Options, device: torch
     if name == "vanilla-nerf":
         # Rendered from the near plane on, as it was trained; nerfstudio would look for something in front of it.
         training.pipeline.model.collider.reset_near_plane = False
+        training.pipeline.datamanager.load_pixels()  # which our own pipelines do once effects are decided
     return training
 
 

@@ -302,7 +302,7 @@ def test_vanilla_nerf_is_made_without_a_network_and_with_its_own_settings(llff_s
     contender = stage1.make_training("vanilla-nerf", scene, options, CPU, seed=0)
     pipeline = contender.pipeline
     assert type(pipeline.model).__module__ == "nerfstudio.models.vanilla_nerf"
-    assert pipeline.datamanager.effects["matched_depth"].choice == "off"
+    assert pipeline.datamanager.matched is None
     assert pipeline.datamanager.config.train_num_rays_per_batch == 1024
     assert type(contender.optimizers.optimizers["fields"]).__name__ == "RAdam"
     assert 1.0 < pipeline.model.collider.near_plane < pipeline.model.collider.far_plane

@@ -10,12 +10,7 @@ from jaxtyping import Float, Int, UInt8
 
 @dataclass
 class Features:
-    """The features of a photo.
-
-    Attributes:
-        points: where they are, (x, y) in pixels; the centre of the first pixel is (0, 0).
-        descriptors: what they look like, as vectors of length 1.
-    """
+    """A photo's features: (x, y) in pixels with the centre of the first at (0, 0), and descriptors of length 1."""
 
     points: Float[np.ndarray, "features 2"]
     descriptors: Float[np.ndarray, "features 128"]
@@ -25,13 +20,7 @@ class Features:
 
 
 def find_features(grey: UInt8[np.ndarray, "H W"], count: int, min_contrast: float = 0.04) -> Features:
-    """The SIFT features of a grey picture.
-
-    Args:
-        grey: the picture.
-        count: how many to keep at most, the strongest first.
-        min_contrast: contrast below which a feature is dropped; 0.04 is OpenCV's default.
-    """
+    """A grey picture's SIFT features: the `count` strongest, of at least this contrast (OpenCV's default: 0.04)."""
     sift = cv2.SIFT_create(nfeatures=count, contrastThreshold=min_contrast)
     keypoints, descriptors = sift.detectAndCompute(grey, None)
     if not keypoints:
@@ -53,14 +42,10 @@ def linked_groups(count: int, links: Iterable[Tuple[int, int]]) -> List[Set[int]
 def mutual_matches(
     first: Float[np.ndarray, "features 128"], second: Float[np.ndarray, "others 128"], max_ratio: float
 ) -> Tuple[Int[np.ndarray, "matches"], Int[np.ndarray, "matches"]]:
-    """Which unit descriptors are each other's nearest, and clearly nearer than the second nearest.
+    """Places of unit descriptors that are each other's nearest, and clearly nearer than the second nearest.
 
     Args:
-        first, second: the descriptors of two photos.
         max_ratio: Lowe's ratio, the best match's distance over the second best's, in (0, 1]; lower is stricter.
-
-    Returns:
-        Their places in `first` and in `second`.
     """
     if min(len(first), len(second)) < 2:
         return np.empty(0, int), np.empty(0, int)

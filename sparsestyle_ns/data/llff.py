@@ -18,7 +18,7 @@ from typing import List, NamedTuple, Optional, Tuple, Type
 import numpy as np
 import torch
 from jaxtyping import Float
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -31,7 +31,6 @@ from sparsestyle_ns.data.photos import check_one_size, images_in, open_photo, ph
 from sparsestyle_ns.data.scene_info import NDC, SCENE_INFO, SceneInfo
 from sparsestyle_ns.utils.errors import InputError
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 NDC_NEAR = 1.0
 """Distance of NDC's near plane in the scaled world."""
 DEPTH_MARGIN = 0.1
@@ -62,41 +61,30 @@ class LLFFDataParserConfig(DataParserConfig):
 
 
 class LLFFCameras(NamedTuple):
-    """What `poses_bounds.npy` says of each view, in the file's own world and units."""
+    """What `poses_bounds.npy` says of each view, in its own world and units: poses have the columns right, up, back and
+    position, sizes are (width, height) in pixels at full size, as focal lengths, and bounds are depths."""
 
     camera_to_worlds: Float[Tensor, "num_views 3 4"]
-    """Poses, with columns right, up, back and position."""
     full_sizes: Float[Tensor, "num_views 2"]
-    """Width and height in pixels of the images at full size."""
     focals: Float[Tensor, " num_views"]
-    """Focal length in pixels of the images at full size."""
     bounds: Float[Tensor, "num_views 2"]
-    """Distances along the viewing direction of the nearest and the farthest thing seen."""
 
 
 class LLFFDataParser(DataParser):
-    """Reads an LLFF folder.
-
-    The `SceneInfo` in the outputs' metadata has the map to NDC, with bounds of depth that are widened by
-    `DEPTH_MARGIN`; a view's id is its place among the sorted images.
-    """
+    """Reads an LLFF folder; a view's id is its place among the sorted images."""
 
     config: LLFFDataParserConfig
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
-        """Reads the folder and returns one split of it: "train", or "val" and "test", which are the held-out views.
-
-        Raises:
-            InputError: if the folder or a setting cannot be used.
-        """
+        """One split of the folder: "train", or "val" and "test", which are the held-out views."""
         self._check_settings()
         folder, interval = self.config.data, self.config.eval_interval
         read = read_poses_bounds(folder)
-        filenames = find_images(folder, self.config.downscale_factor, num_poses=len(read.focals))
-        width, height = read_image_size(filenames, read.full_sizes)
+        filenames = _find_images(folder, self.config.downscale_factor, num_poses=len(read.focals))
+        width, height = _read_image_size(filenames, read.full_sizes)
 
         # All views take part in recentring and scaling, so that the world does not depend on the split.
-        transform = recentring_transform(read.camera_to_worlds)
+        transform = _recentring_transform(read.camera_to_worlds)
         scale = 1.0 / (self.config.bound_scale * read.bounds.min().item())
         camera_to_worlds = transform[:, :3] @ read.camera_to_worlds
         camera_to_worlds[..., 3] = scale * (camera_to_worlds[..., 3] + transform[:, 3])
@@ -104,24 +92,16 @@ class LLFFDataParser(DataParser):
         focals = read.focals * width / read.full_sizes[:, 0]
         # NDC is one space for all views, and the focal length is only its unit of x and y.
         focal = focals.mean().item()
-        ndc = NDC((2 * focal / width, 2 * focal / height), NDC_NEAR, depth_range(scale * read.bounds))
-
+        nearest, farthest = scale * read.bounds[:, 0].min().item(), scale * read.bounds[:, 1].max().item()
+        depth_range = (1 - DEPTH_MARGIN) * nearest, (1 + DEPTH_MARGIN) * farthest
+        ndc = NDC((2 * focal / width, 2 * focal / height), NDC_NEAR, depth_range)
         view_ids = self._view_ids(split, len(filenames))
-        cameras = Cameras(
-            camera_to_worlds=camera_to_worlds[view_ids].float(),
-            fx=focals[view_ids, None].float(),
-            fy=focals[view_ids, None].float(),
-            cx=width / 2,
-            cy=height / 2,
-            width=width,
-            height=height,
-            camera_type=CameraType.PERSPECTIVE,
-        )
+        poses, fx = camera_to_worlds[view_ids].float(), focals[view_ids, None].float()
         num_views = len(view_ids) if len(view_ids) <= interval else USUAL_NUM_VIEWS
         return DataparserOutputs(
             image_filenames=[filenames[i] for i in view_ids],
-            cameras=cameras,
-            scene_box=ndc_scene_box(camera_to_worlds, focals, (width, height), ndc.focal_over_half_size, filenames),
+            cameras=Cameras(poses, fx, fx, cx=width / 2, cy=height / 2, width=width, height=height),
+            scene_box=_ndc_scene_box(camera_to_worlds, focals, (width, height), ndc.focal_over_half_size, filenames),
             dataparser_scale=scale,
             dataparser_transform=transform.float(),
             metadata={SCENE_INFO: SceneInfo(tuple(view_ids), ndc, default_num_views=num_views)},
@@ -137,7 +117,6 @@ class LLFFDataParser(DataParser):
             raise InputError(f"--downscale-factor {factor} names no folder: give N for images_N, 1 for images.")
 
     def _view_ids(self, split: str, num_views: int) -> List[int]:
-        """Indices into the sorted images of the views in a split."""
         if split not in ("train", "val", "test"):
             raise ValueError(f"Unknown split {split!r}: it is train, val or test.")
         interval = self.config.eval_interval
@@ -152,10 +131,7 @@ class LLFFDataParser(DataParser):
 
 
 def read_poses_bounds(folder: Path) -> LLFFCameras:
-    """Reads and checks `poses_bounds.npy` of an LLFF folder.
-
-    Returns:
-        The cameras in float64, in the order of the rows.
+    """The cameras in `poses_bounds.npy` of an LLFF folder, in float64 and in the order of the rows.
 
     Raises:
         InputError: if the file is missing, is not an array of N rows of 17 numbers, or a row describes no camera.
@@ -169,8 +145,7 @@ def read_poses_bounds(folder: Path) -> LLFFCameras:
             f"and one of images_8, images_4, images{advice(folder, path.name)}."
         )
     rows = _load_rows(path)
-    matrices = rows[:, :15].reshape(-1, 3, 5)
-    down, right, back, position, size = matrices.unbind(-1)
+    down, right, back, position, size = rows[:, :15].reshape(-1, 3, 5).unbind(-1)
     cameras = LLFFCameras(
         camera_to_worlds=torch.stack([right, -down, back, position], dim=-1),
         full_sizes=size[:, [1, 0]],
@@ -224,17 +199,8 @@ def _check_cameras(cameras: LLFFCameras, path: Path) -> None:
             )
 
 
-def find_images(folder: Path, downscale_factor: Optional[int], num_poses: int) -> List[Path]:
-    """Sorted image files of the folder that `downscale_factor` names, one for each pose.
-
-    Args:
-        folder: an LLFF folder.
-        downscale_factor: N for images_N, 1 for images, None for the first of images_8, images_4, images that is there.
-        num_poses: how many images there must be.
-
-    Raises:
-        InputError: if there is no such folder, no image in it, or another number of images than poses.
-    """
+def _find_images(folder: Path, downscale_factor: Optional[int], num_poses: int) -> List[Path]:
+    """Sorted image files of the folder that `downscale_factor` names, one for each pose."""
     names = ["images_8", "images_4", "images"]
     if downscale_factor is not None:
         names = ["images" if downscale_factor == 1 else f"images_{downscale_factor}"]
@@ -243,7 +209,7 @@ def find_images(folder: Path, downscale_factor: Optional[int], num_poses: int) -
         there = sorted(path.name for path in folder.glob("images*") if path.is_dir())
         advice = f"choose from {', '.join(there)} with --downscale-factor" if there else "put the photos into images"
         raise InputError(f"{folder} has no folder {' or '.join(names)}: {advice}.")
-    filenames = images_in(image_folder, IMAGE_SUFFIXES)
+    filenames = images_in(image_folder, (".jpg", ".jpeg", ".png"))
     if not filenames:
         raise InputError(
             f"{image_folder} has no .jpg, .jpeg or .png image: put the photos there, "
@@ -257,23 +223,14 @@ def find_images(folder: Path, downscale_factor: Optional[int], num_poses: int) -
     return filenames
 
 
-def read_image_size(filenames: List[Path], full_sizes: Float[Tensor, "num_views 2"]) -> Tuple[int, int]:
-    """Width and height in pixels that all the images share; each is decoded once to see that it can be.
-
-    Args:
-        filenames: one image for each pose.
-        full_sizes: width and height at full size that the poses are meant for. The images may be any scaled version,
-            with each side rounded up or down to whole pixels.
-
-    Raises:
-        InputError: if an image cannot be read, differs in size from the others, or has another aspect than its pose.
-    """
+def _read_image_size(filenames: List[Path], full_sizes: Float[Tensor, "num_views 2"]) -> Tuple[int, int]:
+    """Width and height in pixels that all the images share; each is decoded once to see that it can be."""
     for filename in filenames:
         open_photo(filename, draft=True)
     check_one_size(filenames)
     width, height = photo_size(filenames[0])
     for filename, (full_width, full_height) in zip(filenames, full_sizes.tolist(), strict=True):
-        # Scaled by one factor, both sides are less than a pixel off.
+        # Scaled by one factor and rounded up or down, both sides are less than a pixel off.
         if abs(width * full_height - height * full_width) >= full_width + full_height:
             raise InputError(
                 f"{filename} is {width}x{height} pixels, which is no scaled version of the "
@@ -283,14 +240,11 @@ def read_image_size(filenames: List[Path], full_sizes: Float[Tensor, "num_views 
     return width, height
 
 
-def recentring_transform(camera_to_worlds: Float[Tensor, "num_views 3 4"]) -> Float[Tensor, "3 4"]:
+def _recentring_transform(camera_to_worlds: Float[Tensor, "num_views 3 4"]) -> Float[Tensor, "3 4"]:
     """The rigid motion that takes the average camera to the origin, looking along -z with y up.
 
     The average camera sits at the mean position; its back vector is the normalised mean of the back vectors, and its up
     vector the mean of the up vectors, made orthogonal to it (as in NeRF's and RegNeRF's reader).
-
-    Raises:
-        InputError: if the views look into all directions, so that they have no average.
     """
     _, up, back, position = camera_to_worlds.mean(0).unbind(-1)
     right = torch.linalg.cross(up, back)
@@ -304,12 +258,7 @@ def recentring_transform(camera_to_worlds: Float[Tensor, "num_views 3 4"]) -> Fl
     return torch.cat([world_to_average, -world_to_average @ position[:, None]], dim=-1)
 
 
-def depth_range(bounds: Float[Tensor, "num_views 2"]) -> Tuple[float, float]:
-    """Depths between which all of a scene lies: the views' extreme bounds, widened by `DEPTH_MARGIN` of each."""
-    return (1 - DEPTH_MARGIN) * bounds[:, 0].min().item(), (1 + DEPTH_MARGIN) * bounds[:, 1].max().item()
-
-
-def ndc_scene_box(
+def _ndc_scene_box(
     camera_to_worlds: Float[Tensor, "num_views 3 4"],
     focals: Float[Tensor, " num_views"],
     size: Tuple[int, int],
@@ -323,13 +272,9 @@ def ndc_scene_box(
 
     Args:
         camera_to_worlds: poses in the recentred, scaled world.
-        focals: focal lengths in pixels of the images as read.
-        size: width and height in pixels of the images as read.
+        focals, size: focal lengths, width and height in pixels of the images as read.
         focal_over_half_size: (2f/w, 2f/h) of NDC.
-        filenames: the views' images, to name one that cannot be used.
-
-    Raises:
-        InputError: if a view looks so far aside that a part of it never reaches the near plane.
+        filenames: the views' images, to name one of which a part never reaches the near plane.
     """
     half_size = torch.tensor(size, dtype=focals.dtype) / 2
     corners = torch.tensor([[-1, -1], [-1, 1], [1, -1], [1, 1]], dtype=focals.dtype) * half_size

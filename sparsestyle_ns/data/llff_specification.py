@@ -1,7 +1,6 @@
-"""What nerfstudio's commands load to offer `llff-data`.
+"""What nerfstudio's commands load to offer `llff-data`, while nerfstudio's own configs are still being imported.
 
-They load it while nerfstudio's own configs are still being imported, so neither this module nor what it imports may
-import a datamanager, a pipeline or `TrainerConfig`.
+So neither this module nor what it imports may import a datamanager, a pipeline or `TrainerConfig`.
 """
 
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification

@@ -5,7 +5,6 @@ those of blurred photos, so that a match that is off by a fraction of a pixel do
 """
 
 from dataclasses import dataclass
-from itertools import combinations
 from typing import List, Optional, Sequence, Tuple
 
 import cv2
@@ -57,32 +56,19 @@ class PointMatches:
 
 @dataclass
 class PixelRays:
-    """Directions of image points in a camera.
-
-    Attributes:
-        directions: right, up and back, of any length.
-        tangents: how they change with the image point over the focal length, to the right and down.
-    """
+    """Directions (right, up, back; of any length) of a camera's image points, and their derivatives over these points,
+    which are in focal lengths, to the right and down."""
 
     directions: Float[np.ndarray, "points 3"]
     tangents: Float[np.ndarray, "points 3 2"]
 
     def __getitem__(self, index: Int[np.ndarray, "some"]) -> "PixelRays":
-        """Some of them."""
         return PixelRays(self.directions[index], self.tangents[index])
 
 
 @dataclass
 class _View:
-    """The features of a photo: what they look like, and what is known of each.
-
-    Attributes:
-        descriptors: see `Features`.
-        rays: where the camera sees them.
-        directions: the same as unit vectors in the world.
-        rgba: colours there, of the blurred photo.
-        pixel: side of a pixel over the focal length.
-    """
+    """A photo's features; `directions` are unit vectors in the world, `pixel` a pixel's side over the focal length."""
 
     descriptors: Float[np.ndarray, "features 128"]
     rays: PixelRays
@@ -92,16 +78,14 @@ class _View:
 
 
 def match_points(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras) -> PointMatches:
-    """Finds points that two photos see; only where both photos are opaque, and by cameras that are `LENSES`.
+    """Points that two RGBA photos in [0, 1] see; only where both are opaque, and by cameras that are `LENSES`.
 
-    Args:
-        photos: RGBA in [0, 1].
-        cameras: one for each, for images of any size with the same aspect.
+    Cameras are one for each photo, for images of any size with the same aspect.
     """
     poses = cameras.camera_to_worlds.double().numpy()
     seen = [_look_at(photo, cameras, index) for index, photo in enumerate(photos)]
     views, colors, directions = [np.zeros((2, 0), int)], [np.zeros((2, 0, 3))], [np.zeros((2, 0, 3))]
-    for pair in neighbouring_pairs(poses):
+    for pair in _neighbouring_pairs(poses):
         both = [seen[index] for index in pair]
         if None in both:
             continue
@@ -118,7 +102,6 @@ def match_points(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras)
 
 
 def _look_at(photo: Float[np.ndarray, "H W 4"], cameras: Cameras, index: int) -> Optional[_View]:
-    """The features of a photo; None where its camera is no `LENSES`."""
     kind = CameraType(int(cameras.camera_type[index]))
     if kind not in LENSES:
         return None
@@ -151,12 +134,11 @@ def distances_along(
     return np.where(parallel, np.inf, along / np.where(parallel, 1.0, square_of_sine))
 
 
-def neighbouring_pairs(poses: Float[np.ndarray, "views 3 4"]) -> List[Tuple[int, int]]:
-    """Pairs of views worth matching: each with the `NEAREST_VIEWS` that look most nearly the same way."""
+def _neighbouring_pairs(poses: Float[np.ndarray, "views 3 4"]) -> List[Tuple[int, int]]:
     agreement = poses[:, :, 2] @ poses[:, :, 2].T
     near = np.argsort(-agreement, axis=1)[:, : NEAREST_VIEWS + 1]
-    wanted = {(min(view, other), max(view, other)) for view in range(len(poses)) for other in near[view].tolist()}
-    return [pair for pair in combinations(range(len(poses)), 2) if pair in wanted]
+    pairs = ((view, other) for view, others in enumerate(near.tolist()) for other in others if other != view)
+    return sorted({(min(pair), max(pair)) for pair in pairs})
 
 
 def undistorted(points: Float[np.ndarray, "points 2"], cameras: Cameras, index: int) -> Float[np.ndarray, "points 2"]:
@@ -170,14 +152,10 @@ def undistorted(points: Float[np.ndarray, "points 2"], cameras: Cameras, index: 
 
 
 def rays_of(points: Float[np.ndarray, "points 2"], kind: CameraType) -> PixelRays:
-    """Where a camera without distortion looks.
+    """Where a camera without distortion sees image points, given over the focal length, right and down of the centre.
 
     A perspective camera's points lie on the plane at the distance 1. A fisheye's are as far from the middle as the
     angle θ to its axis (OpenCV's equidistant projection), so the ray is (sin θ, cos θ) aside and ahead.
-
-    Args:
-        points: image points over the focal length, right and down, from the centre.
-        kind: one of `LENSES`.
     """
     x, y = points.T
     one, zero = np.ones_like(x), np.zeros_like(x)
@@ -206,18 +184,10 @@ def why_unmatched(cameras: Cameras) -> Optional[str]:
 
 
 def epipolar_error(
-    first: PixelRays,
-    second: PixelRays,
-    pose_first: Float[np.ndarray, "3 4"],
-    pose_second: Float[np.ndarray, "3 4"],
+    first: PixelRays, second: PixelRays, pose_first: Float[np.ndarray, "3 4"], pose_second: Float[np.ndarray, "3 4"]
 ) -> Float[np.ndarray, "matches"]:
-    """Sampson's distance of matches from the epipolar geometry, in units of the focal length (Hartley and Zisserman,
-    Multiple View Geometry, Eq. 11.9; for a fisheye, its gradient is that over the fisheye's own image points).
-
-    Args:
-        first, second: the matches' rays in each camera.
-        pose_first, pose_second: camera to world.
-    """
+    """Sampson's distance of matches from the epipolar geometry of two camera-to-world poses, in focal lengths (Hartley
+    and Zisserman, Multiple View Geometry, Eq. 11.9; a fisheye's gradient is over its own image points)."""
     rotation = pose_second[:, :3].T @ pose_first[:, :3]
     x, y, z = pose_second[:, :3].T @ (pose_first[:, 3] - pose_second[:, 3])
     essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation

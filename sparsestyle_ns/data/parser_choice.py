@@ -16,23 +16,14 @@ MARKERS = {
 """Files that tell a scene's dataparser."""
 
 
-def marker_of(folder: Path) -> Optional[str]:
-    """The file in a scene's folder that tells its dataparser (see `MARKERS`); None where there is none."""
+def _marker_of(folder: Path) -> Optional[str]:
     return next((marker for marker in MARKERS if (folder / marker).is_file()), None)
 
 
 def advice(folder: Path, missing: str) -> str:
-    """The end of an error message about a missing file: which dataparser to name instead.
-
-    Args:
-        folder: the scene's.
-        missing: the file that another dataparser looked for.
-
-    Returns:
-        Words that begin with a semicolon; none where the folder's files don't tell.
-    """
-    marker = marker_of(folder)
-    if marker is None or marker == missing:
+    """The end of an error message about a missing file: a semicolon and which dataparser to name instead, if any."""
+    marker = _marker_of(folder)
+    if marker in (None, missing):
         return ""
     return f"; it has {marker}, which {MARKERS[marker]} reads: put {MARKERS[marker]} at the end of the command"
 
@@ -41,8 +32,7 @@ def parse_dataparser(words: Sequence[str], data: Path) -> DataParserConfig:
     """A dataparser's config from its name and options, as after ns-train; without them from what the folder holds.
 
     Args:
-        words: such as `["colmap", "--colmap-path", "sparse/0"]`; empty for the dataparser that the files tell.
-        data: the scene's folder or file.
+        words: such as `["colmap", "--colmap-path", "sparse/0"]`.
 
     Raises:
         InputError: there is no such dataparser or scene, or nothing tells which dataparser reads it.
@@ -55,7 +45,7 @@ def parse_dataparser(words: Sequence[str], data: Path) -> DataParserConfig:
     if not data.exists():
         raise InputError(f"There is no scene at --data {data}; name its folder.")
     if not words:
-        marker = marker_of(data)
+        marker = _marker_of(data)
         if marker is None:
             raise InputError(
                 f"{data} has none of {', '.join(MARKERS)}, so the dataparser isn't known; name it last, such as colmap."

@@ -24,18 +24,14 @@ DARKEST = 3
 
 def images_in(folder: Path, suffixes: Sequence[str]) -> List[Path]:
     """The files in a folder with one of these suffixes, sorted by name; hidden files are passed over."""
-    return sorted(
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in suffixes and not path.name.startswith(".") and path.is_file()
-    )
+    files = (path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    return sorted(path for path in files if path.suffix.lower() in suffixes)
 
 
 def open_photo(path: Path, draft: bool = False) -> Image.Image:
     """Reads a photo whole.
 
     Args:
-        path: the image file.
         draft: whether a JPEG may come at its smallest size, which is fast and still finds that it is cut short.
 
     Raises:
@@ -59,11 +55,7 @@ def open_photo(path: Path, draft: bool = False) -> Image.Image:
 
 
 def photo_size(path: Path) -> Tuple[int, int]:
-    """Width and height in pixels, from the file's header alone.
-
-    Raises:
-        InputError: there is no such file, or it has no such header.
-    """
+    """Width and height in pixels, from the file's header alone; an `InputError` if there is none."""
     try:
         with Image.open(path) as image:
             return image.size
@@ -72,11 +64,7 @@ def photo_size(path: Path) -> Tuple[int, int]:
 
 
 def check_one_size(filenames: Sequence[Path]) -> None:
-    """Makes sure that photos are of one size.
-
-    Raises:
-        InputError: one isn't of the size that most are of; it is named.
-    """
+    """Raises an `InputError` that names the first photo that isn't of the size that most are of."""
     sizes = {filename: photo_size(filename) for filename in filenames}
     usual = Counter(sizes.values()).most_common(1)[0][0]
     for filename, size in sizes.items():
@@ -100,12 +88,7 @@ def at_size(cameras: Cameras, width: Int[Tensor, "views 1"], height: Int[Tensor,
     return resized
 
 
-def check_content(path: Path, pixels: UInt8[np.ndarray, "H W channels"]) -> None:
-    """Makes sure that a photo shows something.
-
-    Raises:
-        InputError: it is transparent all over, or black, or smaller than anything can be seen in.
-    """
+def _check_content(path: Path, pixels: UInt8[np.ndarray, "H W channels"]) -> None:
     height, width, channels = pixels.shape
     if min(height, width) < SMALLEST_SIDE:
         raise InputError(
@@ -113,29 +96,22 @@ def check_content(path: Path, pixels: UInt8[np.ndarray, "H W channels"]) -> None
             "other views with --view-ids."
         )
     opaque = channels == 3 or pixels[..., 3].min() == 255
-    if not opaque and pixels[..., 3].max() == 0:
-        kind = "transparent"
-    elif opaque and pixels[..., :3].max() <= DARKEST:
-        kind = "black"
-    else:
-        return
-    raise InputError(f"{path} is {kind} all over: replace it, or choose other views with --view-ids.")
+    nothing = pixels[..., :3].max() <= DARKEST if opaque else pixels[..., 3].max() == 0
+    if nothing:
+        kind = "black" if opaque else "transparent"
+        raise InputError(f"{path} is {kind} all over: replace it, or choose other views with --view-ids.")
 
 
 class PhotoDataset(InputDataset):
     """nerfstudio's dataset of images, which raises an `InputError` for those that can't be used."""
 
     def get_numpy_image(self, image_idx: int) -> UInt8[np.ndarray, "H W channels"]:
-        """Pixels of a photo, [H, W, 3 or 4], at the size of its camera.
-
-        Raises:
-            InputError: it can't be read, is not of its camera's size, or shows nothing.
-        """
+        """Pixels of a photo, RGB or RGBA, at the size of its camera."""
         path = self.image_filenames[image_idx]
         image = open_photo(path)
         if image.mode == "L":
             image = image.convert("RGB")
-        check_content(path, np.asarray(image))
+        _check_content(path, np.asarray(image))
         size = int(self.cameras.width[image_idx]), int(self.cameras.height[image_idx])
         # Products of sides and scales may fall to either side of a whole number.
         if any(abs(own * self.scale_factor - side) > 1 for own, side in zip(image.size, size, strict=True)):
@@ -147,11 +123,7 @@ class PhotoDataset(InputDataset):
         return np.array(image if image.size == size else image.resize(size, resample=Image.Resampling.BILINEAR))
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> Dict[str, Any]:
-        """nerfstudio's dictionary of a photo and, where there is one, its mask.
-
-        Raises:
-            InputError: the photo or the mask can't be used.
-        """
+        """nerfstudio's dictionary of a photo and, where there is one, its mask."""
         try:
             return super().get_data(image_idx, image_type)
         except InputError:

@@ -1,10 +1,9 @@
 """Reading a scene with any dataparser, with errors that name what is wrong; nerfstudio's own check next to nothing."""
 
 from dataclasses import replace
-from typing import Callable, Dict, NamedTuple, Optional, Tuple, Type
 
 import torch
-from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
@@ -15,33 +14,10 @@ from sparsestyle_ns.data.view_selection import BLENDER_VIEWS
 from sparsestyle_ns.utils.errors import InputError
 
 
-def check_blender_files(config: BlenderDataParserConfig, split: str) -> None:
-    """Checks the poses of a split, and the photo that gives all its cameras their size."""
+def _check_blender_files(config: BlenderDataParserConfig, split: str) -> None:
     frames = read_transforms(config.data / f"transforms_{split}.json", with_angle=True)["frames"]
     first = frames[0]["file_path"].replace("./", "")
-    open_photo(config.data / f"{first}.png")
-
-
-def check_nerfstudio_files(config: NerfstudioDataParserConfig, split: str) -> None:
-    """Checks the poses of a capture."""
-    is_file = config.data.suffix == ".json"
-    read_transforms(config.data if is_file else config.data / "transforms.json", with_angle=False)
-
-
-class Adapter(NamedTuple):
-    """What one of nerfstudio's dataparsers lacks."""
-
-    check_files: Callable[[DataParserConfig, str], None]
-    """Looks at the files of a split before they are read; raises an `InputError`."""
-    standard_views: Optional[Tuple[int, ...]] = None
-    """See `SceneInfo`."""
-
-
-ADAPTERS: Dict[Type[DataParserConfig], Adapter] = {
-    BlenderDataParserConfig: Adapter(check_blender_files, BLENDER_VIEWS),
-    NerfstudioDataParserConfig: Adapter(check_nerfstudio_files),
-}
-"""By the dataparser's config; others are read as they are."""
+    open_photo(config.data / f"{first}.png")  # it gives all cameras their size
 
 
 def read_scene(parser: DataParser, split: str = "train") -> DataparserOutputs:
@@ -51,9 +27,11 @@ def read_scene(parser: DataParser, split: str = "train") -> DataparserOutputs:
         InputError: the scene can't be read, or a camera in it can't be used.
     """
     config = parser.config
-    adapter = next((adapter for kind, adapter in ADAPTERS.items() if isinstance(config, kind)), None)
-    if adapter is not None:
-        adapter.check_files(config, split)
+    if isinstance(config, BlenderDataParserConfig):
+        _check_blender_files(config, split)
+    if isinstance(config, NerfstudioDataParserConfig):
+        is_file = config.data.suffix == ".json"
+        read_transforms(config.data if is_file else config.data / "transforms.json", with_angle=False)
     try:
         outputs = parser.get_dataparser_outputs(split)
     except InputError:
@@ -65,22 +43,15 @@ def read_scene(parser: DataParser, split: str = "train") -> DataparserOutputs:
             f"{config.data} can't be read as a scene of the kind {name} ({type(error).__name__}: {reason}); correct "
             "its files, or choose the dataparser that they were made for."
         ) from error
-    check_cameras(outputs)
+    _check_cameras(outputs)
     if SCENE_INFO in outputs.metadata:
         return outputs
-    info = SceneInfo(
-        view_ids=tuple(range(len(outputs.image_filenames))),
-        standard_views=None if adapter is None else adapter.standard_views,
-    )
+    standard_views = BLENDER_VIEWS if isinstance(config, BlenderDataParserConfig) else None
+    info = SceneInfo(tuple(range(len(outputs.image_filenames))), standard_views=standard_views)
     return replace(outputs, metadata={**outputs.metadata, SCENE_INFO: info})
 
 
-def check_cameras(outputs: DataparserOutputs) -> None:
-    """Makes sure that cameras are finite and have an angle of view.
-
-    Raises:
-        InputError: one isn't or hasn't; its photo is named.
-    """
+def _check_cameras(outputs: DataparserOutputs) -> None:
     cameras = outputs.cameras
     if len(cameras) == 0:  # a split may be empty
         return

@@ -16,9 +16,7 @@ SCENE_INFO = "scene_info"
 
 @dataclass(frozen=True)
 class NDC:
-    """The map of a forward-facing scene to normalised device coordinates (`core.ndc`).
-
-    With it, the outputs' scene box is in NDC too.
+    """The map of a forward-facing scene, and so of its scene box, to normalised device coordinates (`core.ndc`).
 
     Attributes:
         focal_over_half_size: (2f/w, 2f/h), f, w and h in pixels.
@@ -36,10 +34,9 @@ class SceneInfo:
     """One split of a scene.
 
     Attributes:
-        view_ids: the number of each view, by which `--view-ids` chooses it; the views are in the outputs' order.
-        ndc: for a scene whose bounds of depth are known; None where space can't be laid out in NDC.
-        standard_views: ids of the few views that papers train on, in their order; None where there is no such protocol,
-            and views are taken at even steps.
+        view_ids: the number of each view, by which `--view-ids` chooses it, in the outputs' order.
+        ndc: None where the bounds of depth aren't known.
+        standard_views: ids of the few views that papers train on, in their order; None: views at even steps.
         default_num_views: how many views to train on unless `--num-views` says otherwise.
     """
 

@@ -11,22 +11,16 @@ from sparsestyle_ns.data.parser_choice import advice
 from sparsestyle_ns.utils.errors import InputError
 
 LENGTHS = ("fl_x", "fl_y", "w", "h")
-"""Entries in pixels, above 0, for all cameras or, in a frame, for its own."""
 NUMBERS = ("cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
-"""Entries that are any number."""
 ANGLE = "camera_angle_x"
-"""Entry for the horizontal angle of view, in radians."""
+"""Entries, for all cameras or, in a frame, for its own: in pixels and above 0, any number, and in radians."""
 
 
 def read_transforms(path: Path, with_angle: bool) -> Dict[str, Any]:
-    """Reads a `transforms….json`, and makes sure that every frame names a photo and has a camera pose.
+    """What a `transforms….json` holds, in which every frame names a photo and has a camera pose.
 
     Args:
-        path: the file.
         with_angle: whether it must have `camera_angle_x`, the horizontal angle of view in radians.
-
-    Returns:
-        What it holds.
 
     Raises:
         InputError: it isn't there, is no such file, or a frame, counted from 0, lacks something.
@@ -50,15 +44,7 @@ def read_transforms(path: Path, with_angle: bool) -> Dict[str, Any]:
 
 
 def check_lenses(path: Path, content: Dict[str, Any]) -> None:
-    """Makes sure that what a `transforms.json` says of lenses and sizes, of all cameras or of one, is numbers.
-
-    Args:
-        path: the file.
-        content: what `read_transforms` read there.
-
-    Raises:
-        InputError: something isn't a number, or none that a camera can have.
-    """
+    """Raises an `InputError` if what `read_transforms` read of a lens or size is no number that a camera can have."""
     frames = [(f"frame {index} (from 0) of {path}", frame) for index, frame in enumerate(content["frames"])]
     for where, given in [(str(path), content), *frames]:
         for key in LENGTHS:

@@ -28,7 +28,6 @@ def select_views(
 
     Args:
         available: ids of the views that may be trained on, in the dataparser's order.
-        num_views: how many; None for `default_num_views`.
         view_ids: the user's choice of ids, in the order given; overrules `num_views`.
         standard: ids a protocol prescribes, in its order; taken from the front where all of them are available and
             `num_views` is at most their number.
@@ -38,9 +37,8 @@ def select_views(
     """
     if not available:
         raise InputError("The scene has no view that can be trained on; give it photos with camera poses.")
-    position = {view: index for index, view in enumerate(available)}
     if view_ids is not None:
-        missing = [view for view in view_ids if view not in position]
+        missing = [view for view in view_ids if view not in available]
         if missing:
             raise InputError(
                 f"--view-ids names {', '.join(map(str, missing))}, but the views that can be trained on are "
@@ -48,12 +46,12 @@ def select_views(
             )
         if len(set(view_ids)) != len(view_ids) or not view_ids:
             raise InputError(f"--view-ids is {list(view_ids)}; name at least one view, each only once.")
-        return tuple(position[view] for view in view_ids)
+        return tuple(map(available.index, view_ids))
     wanted = default_num_views if num_views is None else num_views
     if wanted < 1:
         raise InputError(f"--num-views is {wanted}; at least one view is needed.")
     if num_views is not None and num_views > len(available):
         raise InputError(f"--num-views is {num_views}, but only {len(available)} views can be trained on.")
-    if standard is not None and wanted <= len(standard) and all(view in position for view in standard):
-        return tuple(position[view] for view in standard[:wanted])
+    if standard is not None and wanted <= len(standard) and set(standard) <= set(available):
+        return tuple(map(available.index, standard[:wanted]))
     return evenly_spaced(len(available), wanted)

@@ -6,23 +6,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestyle_ns.effects.base import Decisions, Effect, Measurement
+from sparsestyle_ns.effects.base import Decisions, Measurement
 from sparsestyle_ns.effects.layouts import MIN_EMPTY_BORDER
 from sparsestyle_ns.effects.scene import Scene
 
 
 def measure_background(scene: Scene) -> Measurement:
     """The share of the photos' border that shows nothing, and the colour there."""
-    color = scene.background_color
+    color, on = scene.background_color, scene.empty_border >= MIN_EMPTY_BORDER
     reason = "of the photos' border is empty, too little to tell a background colour"
-    on = scene.empty_border >= MIN_EMPTY_BORDER
     if on:
         kind = "is transparent" if scene.transparent else "has one colour"
         reason = f"of the photos' border {kind}: RGB {', '.join(f'{value:.2f}' for value in color)}"
     return Measurement(on, reason, scene.empty_border, MIN_EMPTY_BORDER, {"color": color})
-
-
-BACKGROUND = Effect("background", measure_background)
 
 
 def background_color(effects: Decisions) -> Optional[Float[Tensor, "3"]]:

@@ -1,4 +1,4 @@
-"""What an effect is, how the command line sets it, and what was decided about all of them.
+"""How the command line sets effects, what is measured for one, and what was decided about all of them.
 
 An effect is a part of the simulation that some scenes need and others don't. What is off is never built.
 """
@@ -6,14 +6,11 @@ An effect is a part of the simulation that some scenes need and others don't. Wh
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Literal, Optional, Tuple
+from typing import Any, Dict, List, Literal, Optional, Tuple
 
-from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.utils.errors import InputError
 
 EffectChoice = Literal["auto", "on", "off"]
-Source = Literal["photos", "coarse field", "style image"]
-FILE_NAME = "effects.json"
 
 
 @dataclass(frozen=True)
@@ -49,10 +46,10 @@ class Measurement:
     """What was measured of a scene for one effect.
 
     Attributes:
-        on: whether the scene needs the effect.
+        on: whether the scene needs the effect; an assumption where what it measures isn't there yet.
         reason: why. Where there is a value, the text goes on from it: "0.31", "of space is empty".
         value: what was measured; None where nothing could be.
-        threshold: what it was compared with; None where there is nothing to compare with.
+        threshold: what it was compared with.
         parameters: numbers that building the effect needs, by name.
         possible: whether the effect can be simulated for this scene at all; if not, the reason says what is missing.
     """
@@ -66,34 +63,8 @@ class Measurement:
 
 
 @dataclass(frozen=True)
-class Effect:
-    """One effect.
-
-    Attributes:
-        name: as on the command line, `--pipeline.effects.NAME`, and in `EffectSettings`.
-        measure: measures a scene. Before there is what it measures (a coarse field, a painting), `on` is an assumption.
-        source: what is measured. Effects of the photos are decided before stage 1, and stage 2 takes them over.
-        layout: whether it is a way to lay out space, of which exactly one is on.
-    """
-
-    name: str
-    measure: Callable[[Scene], Measurement]
-    source: Source = "photos"
-    layout: bool = False
-
-
-@dataclass(frozen=True)
 class Decision:
-    """Whether one effect is on, and why.
-
-    Attributes:
-        name: the effect's.
-        on: whether it is simulated.
-        measured, threshold: see `Measurement`.
-        reason: in words.
-        choice: what the command line said.
-        parameters: see `Measurement`.
-    """
+    """Whether one effect is simulated, and why: what was measured (see `Measurement`), and what the user chose."""
 
     name: str
     on: bool
@@ -109,17 +80,13 @@ class Decision:
         return self.name, "on" if self.on else "off", measured, threshold, self.reason
 
 
-COLUMNS = ("effect", "is", "measured", "threshold", "why")
-
-
 @dataclass(frozen=True)
 class Decisions:
-    """What is simulated, one decision for each effect. `registry.decide` makes it."""
+    """What is simulated: one decision for each effect, as `registry.decide` made it."""
 
     items: Tuple[Decision, ...]
 
     def __getitem__(self, name: str) -> Decision:
-        """The decision about an effect."""
         return {item.name: item for item in self.items}[name]
 
     def on(self, name: str) -> bool:
@@ -141,39 +108,20 @@ class Decisions:
 
     def save(self, folder: Path) -> None:
         """Writes `effects.json` into a run's folder."""
-        (folder / FILE_NAME).write_text(self.json(), encoding="utf-8")
+        (folder / "effects.json").write_text(self.json(), encoding="utf-8")
 
     def json(self) -> str:
         """The decisions as JSON: a list `effects` of name, on, measured, threshold, reason, …"""
         return json.dumps({"effects": self.records()}, indent=1, ensure_ascii=False) + "\n"
 
-    def rows(self) -> List[Tuple[str, ...]]:
-        """The decisions as a table, its heading first."""
-        return [COLUMNS, *(item.cells() for item in self.items)]
-
-    def markdown(self) -> str:
-        """The decisions as a Markdown table."""
-        heading, *rows = self.rows()
-        return "\n".join("| " + " | ".join(row) + " |" for row in [heading, ("---",) * len(COLUMNS), *rows])
-
     def text(self) -> str:
         """The decisions as a table for a terminal."""
-        rows = self.rows()
-        widths = [max(len(row[column]) for row in rows) for column in range(len(COLUMNS) - 1)]
-        return "\n".join(
-            "  ".join([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[-1]]) for row in rows
-        )
+        rows = [("effect", "is", "measured", "threshold", "why"), *(item.cells() for item in self.items)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
 
     def check_choices(self, settings: EffectSettings, whose: str) -> None:
-        """Makes sure that the command line doesn't contradict what was decided before.
-
-        Args:
-            settings: from the command line.
-            whose: where the decisions are from, in words.
-
-        Raises:
-            InputError: it does.
-        """
+        """Raises an `InputError` if the command line contradicts what was decided by `whose`, in words."""
         for item in self.items:
             choice = getattr(settings, item.name)
             if choice != "auto" and (choice == "on") != item.on:

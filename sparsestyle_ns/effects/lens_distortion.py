@@ -1,10 +1,11 @@
 """Lenses that bend straight lines: nerfstudio bends the rays by the cameras' distortion parameters."""
 
 import numpy as np
+import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from sparsestyle_ns.data.matches import undistorted
-from sparsestyle_ns.effects.base import Effect, Measurement
+from sparsestyle_ns.effects.base import Measurement
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_PIXELS = 0.25
@@ -18,15 +19,11 @@ def largest_shift(cameras: Cameras) -> float:
     around = np.linspace(-1.0, 1.0, 9)
     sides = [np.stack([around, np.full(9, side)], axis=-1) for side in (-1.0, 1.0)]
     rim = np.concatenate([*sides, *(side[:, ::-1] for side in sides)])
-    shifts = []
-    for index in range(len(cameras)):
-        focal = np.array([float(cameras.fx[index]), float(cameras.fy[index])])
-        center = np.array([float(cameras.cx[index]), float(cameras.cy[index])])
-        half = 0.5 * np.array([float(cameras.width[index]), float(cameras.height[index])])
-        points = (half + rim * half - center) / focal
-        moved = (undistorted(points, cameras, index) - points) * focal
-        shifts.append(float(np.linalg.norm(moved, axis=-1).max()))
-    return max(shifts)
+    pairs = ((cameras.fx, cameras.fy), (cameras.cx, cameras.cy), (cameras.width, cameras.height))
+    focals, centers, sizes = (torch.cat(pair, dim=-1).double().numpy()[:, None] for pair in pairs)
+    points = (0.5 * sizes * (1.0 + rim) - centers) / focals
+    moved = np.stack([undistorted(each, cameras, index) for index, each in enumerate(points)])
+    return float(np.linalg.norm((moved - points) * focals, axis=-1).max())
 
 
 def measure_lens_distortion(scene: Scene) -> Measurement:
@@ -37,6 +34,3 @@ def measure_lens_distortion(scene: Scene) -> Measurement:
         return Measurement(True, "rays of FISHEYE624 cameras need their distortion parameters", None, MIN_PIXELS)
     shift = largest_shift(scene.cameras)
     return Measurement(shift >= MIN_PIXELS, "pixels at most by which the lens moves a point", shift, MIN_PIXELS)
-
-
-LENS_DISTORTION = Effect("lens_distortion", measure_lens_distortion)

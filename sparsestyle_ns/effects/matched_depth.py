@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestyle_ns.data.matches import distances_along, why_unmatched
-from sparsestyle_ns.effects.base import Decisions, Effect, Measurement
+from sparsestyle_ns.effects.base import Decisions, Measurement
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_POINTS = 100
@@ -21,13 +21,7 @@ MIN_POINTS = 100
 
 @dataclass
 class MatchedRays:
-    """Rays to points whose depth is known.
-
-    Attributes:
-        origins, directions: world rays, directions of unit length.
-        distances: from the origin to the point, in world units.
-        views: index of the training view.
-    """
+    """Rays of unit direction to points whose distance is known, in the world, and the training views they are from."""
 
     origins: Float[Tensor, "rays 3"]
     directions: Float[Tensor, "rays 3"]
@@ -39,10 +33,7 @@ class MatchedRays:
 
 
 def triangulate(scene: Scene) -> MatchedRays:
-    """Two rays for each point that two photos share and that lies in front of both, one from each camera.
-
-    Points are where the two rays come nearest to each other.
-    """
+    """Two rays, one from each camera, for each point that two photos share: where they come nearest, if before both."""
     matches, poses = scene.matches, scene.cameras.camera_to_worlds.double().numpy()
     views = np.array(scene.matched_views, dtype=int)[matches.views]
     origins = poses[views, :, 3]
@@ -61,9 +52,6 @@ def measure_matched_depth(scene: Scene) -> Measurement:
     count = len(triangulate(scene)) / max(1, len(scene.matched_views))
     words = "points a photo, on average, have a depth known from another photo"
     return Measurement(count >= MIN_POINTS, words, count, float(MIN_POINTS), possible=count > 0)
-
-
-MATCHED_DEPTH = Effect("matched_depth", measure_matched_depth)
 
 
 def matched_rays(effects: Decisions, scene: Scene) -> Optional[MatchedRays]:

@@ -1,7 +1,10 @@
 """The painting's palette, given to the photos before stylising (ARF's transfer of mean colour and covariance)."""
 
-from sparsestyle_ns.effects.base import Effect, Measurement
-from sparsestyle_ns.effects.scene import Scene, foreground_colors
+import numpy as np
+import torch
+
+from sparsestyle_ns.effects.base import Measurement
+from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.style.color import color_moments, gaussian_distance
 
 MIN_DISTANCE = 8.0
@@ -12,10 +15,7 @@ def measure_palette(scene: Scene) -> Measurement:
     """The distance between Gaussians with the moments of both palettes, in 1/255."""
     if scene.style_image is None:
         return Measurement(True, "assumed until there is a style image to measure", None, MIN_DISTANCE)
-    photos = color_moments(foreground_colors(scene))
-    style = color_moments(scene.style_image.flatten(1).T)
+    opaque = np.concatenate([photo[photo[..., 3] > 0.5][:, :3] for photo in scene.photos])
+    photos, style = color_moments(torch.from_numpy(opaque)), color_moments(scene.style_image.flatten(1).T)
     distance = 255.0 * float(gaussian_distance(*photos, *style))
     return Measurement(distance >= MIN_DISTANCE, "of 255 between the two palettes", distance, MIN_DISTANCE)
-
-
-PALETTE = Effect("palette", measure_palette, source="style image")

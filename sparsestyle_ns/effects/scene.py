@@ -1,7 +1,4 @@
-"""What effects are measured on: the training photos and their cameras, and later the coarse field and the painting.
-
-Everything is read and computed at most once, and only when an effect asks for it.
-"""
+"""What effects are measured on, read and computed at most once, and only when an effect asks for it."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -33,13 +30,7 @@ SAME_COLOR = 6 / 255
 
 @dataclass
 class Scene:
-    """A scene's training views.
-
-    Attributes:
-        outputs: what the dataparser says of them, as read by `read_scene`.
-        coarse_density: σ_c at field coordinates, once there is a coarse field.
-        style_image: the painting, once it is known.
-    """
+    """A scene's training views as `read_scene` gives them, and once known σ_c at field coordinates and the painting."""
 
     outputs: DataparserOutputs
     coarse_density: Optional[Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]] = None
@@ -93,11 +84,7 @@ class Scene:
 
 
 def read_rgba(path: Path) -> Float[np.ndarray, "H W 4"]:
-    """A photo, reduced to `LONGEST_SIDE`.
-
-    Raises:
-        InputError: it can't be read.
-    """
+    """A photo, reduced to `LONGEST_SIDE`; an `InputError` if it can't be read."""
     image = open_photo(path).convert("RGBA")
     image.thumbnail((LONGEST_SIDE, LONGEST_SIDE), Image.Resampling.BOX)
     return np.asarray(image, dtype=np.float32) / 255.0
@@ -110,8 +97,3 @@ def border(photo: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "pixels C"]:
     rim = max(1, round(BORDER * max(height, width)))
     inside[rim:-rim, rim:-rim] = True
     return photo[~inside]
-
-
-def foreground_colors(scene: Scene) -> Float[Tensor, "pixels 3"]:
-    """Colours of all photos' opaque pixels."""
-    return torch.from_numpy(np.concatenate([photo[photo[..., 3] > 0.5][:, :3] for photo in scene.photos]))

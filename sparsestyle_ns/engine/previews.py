@@ -5,6 +5,8 @@ from typing import FrozenSet, Sequence
 
 import torch
 from jaxtyping import Float
+from nerfstudio.utils import writer
+from nerfstudio.utils.decorators import check_main_thread
 from PIL import Image
 from torch import Tensor
 
@@ -27,6 +29,23 @@ def preview_steps(shares: Sequence[float], total: int) -> FrozenSet[int]:
     return frozenset(max(1, round(share * total)) for share in shares)
 
 
+def preview_path(run: Path, iterations: int) -> Path:
+    """Where the preview after so many iterations is, in a run's folder."""
+    return run / "previews" / f"after-{iterations:06d}.png"
+
+
+@check_main_thread
+def write_preview(pipeline: CheckedPipeline, run: Path, iterations: int, longest_side: int) -> None:
+    """Puts a preview into the run's folder, and into tensorboard where that is on."""
+    picture = render_preview(pipeline, longest_side)
+    writer.put_image(name="Preview", image=picture, step=iterations)
+    image = Image.fromarray(writer.to8b(picture).cpu().numpy())
+    try:
+        write_whole(preview_path(run, iterations), lambda file: image.save(file, "PNG"))
+    except OSError as error:
+        say(f"The preview after {iterations} iterations can't be saved ({error.strerror}); training goes on.")
+
+
 @torch.no_grad()
 def render_preview(pipeline: CheckedPipeline, longest_side: int) -> Float[Tensor, "H W 3"]:
     """The middle one of the held-out views: photo, unstylised render where there is one, and render, side by side.
@@ -47,17 +66,3 @@ def render_preview(pipeline: CheckedPipeline, longest_side: int) -> Float[Tensor
     pipeline.train()
     renders = [outputs[name] for name in ("rgb_coarse", "rgb") if name in outputs]
     return torch.cat([photo, *renders], dim=1)
-
-
-def preview_path(run: Path, iterations: int) -> Path:
-    """Where the preview after so many iterations is, in a run's folder."""
-    return run / "previews" / f"after-{iterations:06d}.png"
-
-
-def save_preview(picture: Float[Tensor, "H W 3"], run: Path, iterations: int) -> None:
-    """Writes a preview into the folder previews of a run; where that can't be done, says so."""
-    image = Image.fromarray((picture.clamp(0.0, 1.0) * 255.0).byte().cpu().numpy())
-    try:
-        write_whole(preview_path(run, iterations), lambda file: image.save(file, "PNG"))
-    except OSError as error:
-        say(f"The preview after {iterations} iterations can't be saved ({error.strerror}); training goes on.")

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Dict, List, Literal, Optional
 
 import torch
-from nerfstudio.utils import writer
-from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils import comms, writer
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
@@ -80,7 +79,8 @@ class HierStyleTrainer(SparseStyleTrainer):
             self._begin(pipeline)
         self.config = replace(self.config, pipeline=pipeline)
         super().setup(test_mode)
-        self._keep_thumbnail()
+        if comms.is_main_process():
+            save_thumbnail(self.base_dir, self._style.painting)
         if self._start_step == 0:
             rate = self.optimizers.optimizers["fields"].param_groups[0]["lr"]
             with bar("Warm start", pipeline.warm_start_steps) as warming:
@@ -107,10 +107,6 @@ class HierStyleTrainer(SparseStyleTrainer):
         scene.coarse_density, scene.style_image = run.density(decided), self._style.painting.pixels
         pipeline.decided = decide(scene, pipeline.effects, decided)
         self._coarse_state = run.model_state()
-
-    @check_main_thread
-    def _keep_thumbnail(self) -> None:
-        save_thumbnail(self.base_dir, self._style.painting)
 
     def notes(self) -> CheckpointNotes:
         """See `style_notes`."""

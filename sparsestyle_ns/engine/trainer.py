@@ -22,7 +22,7 @@ from torch import Tensor
 
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.engine.hints import finish, ns_train_style, resume_command
-from sparsestyle_ns.engine.previews import preview_steps, render_preview, save_preview
+from sparsestyle_ns.engine.previews import preview_steps, write_preview
 from sparsestyle_ns.engine.training import check_skipped, training_step
 from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
@@ -249,7 +249,7 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def _look_at_skipped(self, step: int) -> int:
         """Reports steps that were skipped since the last look; returns how many were in a row up to now."""
-        total = self.optimizers.skipped().total
+        total, _ = self.optimizers.skipped()
         if total > self._reported:
             CONSOLE.print(
                 f"Steps skipped up to iteration {step + 1}, because their gradients weren't finite: "
@@ -266,18 +266,12 @@ class SparseStyleTrainer(Trainer, ABC):
     def eval_iteration(self, step: int) -> None:
         """What nerfstudio evaluates after an iteration, and the preview after some; then Ctrl-C ends training."""
         if step + 1 in self._preview_steps:
-            self._write_preview(step + 1)
+            write_preview(self.pipeline, self.base_dir, step + 1, self.config.preview_side)
         super().eval_iteration(step)
         # Not before: what callbacks decide after an iteration wouldn't be in the checkpoint.
         self._interrupted = any_process(self._interrupted, self.pipeline.device)
         if self._interrupted:
             raise TrainingInterruptedError
-
-    @check_main_thread
-    def _write_preview(self, iterations: int) -> None:
-        picture = render_preview(self.pipeline, self.config.preview_side)
-        writer.put_image(name="Preview", image=picture, step=iterations)
-        save_preview(picture, self.base_dir, iterations)
 
     def finish(self) -> None:
         """Prints the command's last line."""

@@ -87,7 +87,7 @@ def check_skipped(optimizers: FiniteOptimizers, most: int, step: int, advice: st
     Raises:
         InputError: there are `most` or more, up to iteration `step`; the sentence ends with `advice`.
     """
-    in_a_row = optimizers.skipped().in_a_row
+    _, in_a_row = optimizers.skipped()
     if in_a_row >= most:
         raise InputError(
             f"Training stopped after iteration {step + 1}, because the gradients of the last {in_a_row} weren't "

@@ -22,8 +22,7 @@ from sparsestyle_ns.core.volrend import dense_weights, effective_samples, optica
 from sparsestyle_ns.evaluation.path_frames import render_path
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID
-from sparsestyle_ns.metrics.gram import gram_distance, gram_matrix
-from sparsestyle_ns.metrics.image import image_metrics, psnr
+from sparsestyle_ns.metrics.image import gram_distance, gram_matrix, image_metrics, psnr
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.runs.run_folder import REPORT_FILE
@@ -177,7 +176,7 @@ def stylisation_figures(
 
     `style_loss` is the nearest neighbour feature matching of Eq. 5, `content_loss` the distance of features (Eq. 5)
     from the unstylised view, and any other loss of `targets` likewise `NAME_loss`; `gram_distance` is that of
-    `metrics.gram`. All but the content loss come with their value for the unstylised view, as `…_before`. With
+    `metrics.image`. All but the content loss come with their value for the unstylised view, as `…_before`. With
     `accumulation`, only where the scene covers the picture: a background can't be stylised.
     """
     content = targets.features(coarse)

@@ -12,7 +12,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sparsestyle_ns.core.camera_paths import unseen_places
-from sparsestyle_ns.losses.semantic import pooled_features, semantic_loss
+from sparsestyle_ns.losses.coarse import pooled_features, semantic_loss
 from sparsestyle_ns.losses.stylization import fit_side
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.pipelines.datamanager import bundle_rays

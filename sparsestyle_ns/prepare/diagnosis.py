@@ -1,6 +1,6 @@
 """What is wrong with a set of photos, in words: whether they share enough, and whether the camera moved.
 
-The camera need not be known. Pairs of photos are compared by matched features that agree on a fundamental matrix F.
+Pairs of photos are compared by matched features that agree on a fundamental matrix F; cameras need not be known.
 Where a homography explains the same matches, the second photo is only a warped first one: the camera turned without
 moving, or all that it saw is flat, and depth can't be told. Where F's epipole, the point that the camera moves towards,
 lies in the middle of the picture, it moved along its line of sight.
@@ -42,12 +42,12 @@ class Pair:
         agreeing: matched features that agree on one geometry.
         flat: share of the agreeing ones that a homography explains.
         epipole: where the second camera lies in the first photo, as an offset from the middle in longer sides; None
-            where a homography explains everything.
+            where too few agree.
     """
 
     agreeing: int
-    flat: float
-    epipole: Optional[Float[np.ndarray, "2"]]
+    flat: float = 0.0
+    epipole: Optional[Float[np.ndarray, "2"]] = None
 
     @property
     def linked(self) -> bool:
@@ -79,19 +79,15 @@ def shrink(image: Image.Image) -> np.ndarray:
 
 
 def compare(first: Features, second: Features, shape: Sequence[int]) -> Pair:
-    """Matches two photos' features and looks at what geometry they agree on.
-
-    Args:
-        shape: rows and columns of the pictures.
-    """
+    """Matches two photos' features and looks at what geometry they agree on; `shape` is (rows, columns)."""
     here, there = mutual_matches(first.descriptors, second.descriptors, MAX_RATIO)
     start, end = first.points[here], second.points[there]
     if len(start) < MIN_MATCHES:
-        return Pair(0, 0.0, None)
+        return Pair(0)
     cv2.setRNGSeed(0)  # the same photos get the same verdict
     matrix, inliers = cv2.findFundamentalMat(start, end, cv2.USAC_MAGSAC, EPIPOLAR_ERROR, 0.999, 10_000)
     if matrix is None or matrix.shape != (3, 3) or inliers.sum() < MIN_MATCHES:
-        return Pair(0 if inliers is None else int(inliers.sum()), 0.0, None)
+        return Pair(0 if inliers is None else int(inliers.sum()))
     agree = inliers.ravel() > 0
     _, explained = cv2.findHomography(start[agree], end[agree], cv2.RANSAC, FLAT_ERROR, maxIters=5_000)
     flat = 0.0 if explained is None else float(explained.mean())
@@ -131,22 +127,23 @@ def _unlinked(pairs: Dict[Tuple[int, int], Pair], names: Sequence[str]) -> List[
 
 
 def _without_depth(pairs: Dict[Tuple[int, int], Pair], names: Sequence[str]) -> List[str]:
-    linked = [pair for pair in pairs.values() if pair.linked]
+    linked = {ids: pair for ids, pair in pairs.items() if pair.linked}
     if not linked:
         return []
-    if not any(pair.has_depth for pair in linked):
+    epipoles = [pair.epipole for pair in linked.values() if pair.has_depth]
+    if not epipoles:
         return [
             "The camera turned without moving, or all that it sees is flat or far away: each photo is a "
             "warped copy of another, from which depth can't be told; take a step to the side between photos."
         ]
     # A short move's epipole is uncertain, so one pair alone says little.
-    if np.median([np.linalg.norm(pair.epipole) for pair in linked if pair.has_depth]) < AXIS_SHARE:
+    if np.median(np.linalg.norm(epipoles, axis=-1)) < AXIS_SHARE:
         return [
             "The camera moved only along its line of sight, where what is in the middle looks the same from "
             "everywhere; take photos from the sides too."
         ]
-    still = [ids for ids, pair in pairs.items() if pair.linked and not pair.has_depth]
     return [
         f"{names[first]} and {names[second]} were taken from (nearly) the same place, so one of them adds little."
-        for first, second in still
+        for (first, second), pair in linked.items()
+        if not pair.has_depth
     ]

@@ -24,8 +24,7 @@ class Photo:
     """A photo.
 
     Attributes:
-        path: its file.
-        image: its pixels, RGB, or RGBA where any are transparent.
+        image: RGB, or RGBA where any pixels are transparent.
         orientation: EXIF's, from 1 (upright) to 8; 1 where it says nothing.
         upright: whether `image` was turned by that; else it has the pixels as they are stored.
     """
@@ -38,14 +37,8 @@ class Photo:
 
 @dataclass(frozen=True)
 class Framing:
-    """What happens to a photo's pixels: it is scaled to `scaled`, then cropped to `size` from `corner` on.
-
-    Attributes:
-        original: the photo's size.
-        scaled: its size after scaling.
-        corner: column and row, after scaling, of the first pixel that is kept.
-        size: the size that all photos end up with.
-    """
+    """What happens to a photo of the size `original`: it is scaled to `scaled`, then cropped to `size`, that of all,
+    from `corner` on, the column and row of the first pixel that is kept."""
 
     original: Size
     scaled: Size
@@ -61,11 +54,7 @@ class Framing:
 
 
 def find_photos(folder: Path) -> List[Path]:
-    """The photos of a folder, by name; where it has none, those of its folder `images`.
-
-    Raises:
-        InputError: there is no such folder, or there are fewer than three photos in it.
-    """
+    """The photos of a folder or, if it has none, of its folder `images`, by name; an `InputError` if fewer than 3."""
     if not folder.is_dir():
         raise InputError(f"There is no folder {folder}; name the folder that the photos are in.")
     for place in (folder, folder / "images"):
@@ -82,11 +71,7 @@ def find_photos(folder: Path) -> List[Path]:
 
 
 def read_photo(path: Path, upright: bool = True) -> Photo:
-    """Reads a photo.
-
-    Args:
-        path: the file.
-        upright: whether to turn it as its EXIF orientation says; else its pixels are taken as they are stored.
+    """Reads a photo, turned as its EXIF orientation says if it is to be upright.
 
     Raises:
         InputError: it can't be read, or is HEIC and the package for that is missing.
@@ -137,17 +122,12 @@ def frame_photos(sizes: Sequence[Size]) -> List[Framing]:
 
 
 def write_photos(photos: Sequence[Photo], framings: Sequence[Framing], folder: Path) -> List[str]:
-    """Writes the photos into a folder, numbered in their order; PNG if all were lossless or any has transparency.
-
-    Returns:
-        Their file names.
-    """
+    """Writes numbered photos and returns their names; PNG if all were lossless or any has transparency."""
     lossless = all(photo.path.suffix.lower() in LOSSLESS_SUFFIXES for photo in photos)
     transparent = any(photo.image.mode == "RGBA" for photo in photos)
     suffix = ".png" if lossless or transparent else ".jpg"
+    names = [f"photo_{number:03d}{suffix}" for number in range(len(photos))]
     folder.mkdir(parents=True)
-    names = []
-    for number, (photo, framing) in enumerate(zip(photos, framings, strict=True)):
-        names.append(f"photo_{number:03d}{suffix}")
-        framing.apply(photo.image).save(folder / names[-1], quality=JPEG_QUALITY, subsampling=0)
+    for name, photo, framing in zip(names, photos, framings, strict=True):
+        framing.apply(photo.image).save(folder / name, quality=JPEG_QUALITY, subsampling=0)
     return names

@@ -25,9 +25,6 @@ def measure_scene(
     """What ns-train would decide with everything on auto.
 
     Args:
-        dataparser: what reads the scene.
-        data: the scene.
-        num_views, view_ids: see `FewShotDataManagerConfig`.
         coarse_run: a run of the scene to measure the effects of stage 2 on; without one they are assumed.
         style_image: the painting; without one its palette counts as another than the photos'.
 

@@ -1,4 +1,4 @@
-"""Camera poses that lie beside photos, brought to the photos' new size."""
+"""Camera poses that lie beside photos, the photos that they are for, and the poses at the photos' new size."""
 
 import json
 import math
@@ -10,7 +10,7 @@ import numpy as np
 
 from sparsestyle_ns.data.llff import read_poses_bounds
 from sparsestyle_ns.data.transforms import check_lenses, read_transforms
-from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, Size
+from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, Photo, Size, read_photo
 from sparsestyle_ns.utils.errors import InputError
 
 POSES_BOUNDS, TRANSFORMS = "poses_bounds.npy", "transforms.json"
@@ -30,14 +30,7 @@ def fits(photo: Size, pose: Size) -> bool:
 
 
 class LLFFPoses:
-    """Poses of a photo set in `poses_bounds.npy`: one row a photo, in the order of their names.
-
-    Args:
-        path: the file.
-
-    Raises:
-        InputError: it can't be used.
-    """
+    """Poses of a photo set in `poses_bounds.npy`: one row a photo, in the order of their names."""
 
     parser = "llff-data"
     """The dataparser that reads what `write` writes."""
@@ -48,11 +41,7 @@ class LLFFPoses:
         self.rows = np.load(path).astype(np.float64)
 
     def photos(self, found: Sequence[Path]) -> List[Path]:
-        """Those of the photos that have poses, in the poses' order.
-
-        Raises:
-            InputError: there are too few, or it isn't clear which pose is whose.
-        """
+        """Those of the photos that have poses; an `InputError` if too few, or if it isn't clear which pose is whose."""
         if len(found) != len(self.rows):
             raise InputError(
                 f"There are {len(found)} photos, but {self.path} has {len(self.rows)} poses; keep exactly one photo "
@@ -119,11 +108,7 @@ class TransformsPoses:
         return {**frames, **self._matched([path for path in found if path.stem not in settled], lambda path: path.stem)}
 
     def _matched(self, found: Sequence[Path], key: Callable[[Path], str]) -> Dict[Path, Dict[str, Any]]:
-        """Photos with their frames, of which keys agree.
-
-        Raises:
-            InputError: a photo's key is that of several frames, or a frame's of several photos.
-        """
+        """Photos with their frames, of which keys agree: an `InputError` if with more than one."""
         frames: Dict[str, List[Dict[str, Any]]] = {}
         for frame in self.content["frames"]:
             frames.setdefault(key(self.path.parent / frame["file_path"]), []).append(frame)
@@ -146,11 +131,7 @@ class TransformsPoses:
         return {path: frames[name][0] for name, path in owners.items()}
 
     def _splits(self, names: Sequence[str]) -> Dict[str, List[str]]:
-        """The file's lists of photos to train on and to hold out, as far as they are used, with new names.
-
-        Args:
-            names: the new name of each frame in use.
-        """
+        """The file's lists of photos to train on and to hold out, with the new name of each frame in use."""
         if not any(split in self.content for split in SPLITS):
             return {}
         renamed = {Path(frame["file_path"]): name for frame, name in zip(self.used, names, strict=True)}
@@ -196,14 +177,46 @@ Poses = Union[LLFFPoses, TransformsPoses]
 
 
 def find_poses(photos: Path) -> Optional[Poses]:
-    """The poses in the folder of the photos or, for a folder `images`, in the one around it; None if there are none.
-
-    Raises:
-        InputError: they can't be used.
-    """
+    """The poses in the folder of the photos or, for a folder `images`, in the one around it; None if there are none."""
     for folder in (photos, photos.parent) if photos.name.startswith("images") else (photos,):
         if (folder / POSES_BOUNDS).is_file():
             return LLFFPoses(folder / POSES_BOUNDS)
         if (folder / TRANSFORMS).is_file():
             return TransformsPoses(folder / TRANSFORMS)
     return None
+
+
+def read_for_pose(path: Path, poses: Optional[Poses], index: int) -> Photo:
+    """A photo as its pose is for it: upright where it has none yet.
+
+    COLMAP and the readers of poses_bounds.npy and transforms.json take pixels as they are stored, whatever EXIF says,
+    so a pose from a file is for these; for the upright photo only where its shape leaves no other choice.
+    """
+    if poses is None:
+        return read_photo(path)
+    stored, expected = read_photo(path, upright=False), poses.size(index)
+    if expected is None or fits(stored.image.size, expected):
+        return stored
+    turned = read_photo(path)
+    if fits(turned.image.size, expected):
+        return turned
+    width, height = stored.image.size
+    raise InputError(
+        f"{path} is {width} × {height} pixels, which is no scaled version of the {expected[0]} × {expected[1]} that "
+        f"its pose in {poses.path} is for; use the photo that the pose was found with."
+    )
+
+
+def say_what_is_turned(photos: Sequence[Photo], poses: Optional[Poses]) -> None:
+    """Prints what was done with photos that aren't stored upright, a line for each way."""
+    told: Dict[str, List[str]] = {}
+    for photo in photos:
+        words = "turned upright, as EXIF says"
+        if not photo.upright:
+            words = f"not turned, though EXIF says so, since poses in {poses.path} are for photos as they are stored"
+        elif poses is not None:
+            words += f", since only then the shape is that of the pose in {poses.path}"
+        if photo.orientation != 1:
+            told.setdefault(words, []).append(photo.path.name)
+    for words, names in told.items():
+        print(f"{', '.join(names)}: {words}")

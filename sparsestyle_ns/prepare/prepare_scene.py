@@ -8,23 +8,15 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Dict, List, Literal, Optional, Sequence
+from typing import List, Literal, Sequence
 
 import torch
 
 from sparsestyle_ns.prepare.diagnosis import check_photos
-from sparsestyle_ns.prepare.framing import (
-    MIN_PHOTOS,
-    Framing,
-    Photo,
-    find_photos,
-    frame_photos,
-    read_photo,
-    write_photos,
-)
-from sparsestyle_ns.prepare.poses import TRANSFORMS, Poses, find_poses, fits
+from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, find_photos, frame_photos, write_photos
+from sparsestyle_ns.prepare.poses import TRANSFORMS, find_poses, read_for_pose, say_what_is_turned
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.ffmpeg import put_ffmpeg_on_path
+from sparsestyle_ns.utils.machine import put_ffmpeg_on_path
 
 PoseSource = Literal["auto", "file", "colmap"]
 
@@ -45,7 +37,6 @@ def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> Pr
     with the photos is printed, a line each, and stops nothing.
 
     Args:
-        photos: their folder.
         output: the scene's folder; must not be there yet, or be empty.
         source: where poses are from: a file beside the photos, COLMAP, or whichever of the two there is, in this order.
 
@@ -60,8 +51,8 @@ def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> Pr
         raise InputError(f"Neither poses_bounds.npy nor transforms.json lies beside the photos in {paths[0].parent}.")
     if poses is not None:
         paths = poses.photos(paths)
-    read = [_read_for_pose(path, poses, index) for index, path in enumerate(paths)]
-    _say_what_is_turned(read, poses)
+    read = [read_for_pose(path, poses, index) for index, path in enumerate(paths)]
+    say_what_is_turned(read, poses)
     framings = frame_photos([photo.image.size for photo in read])
     _say_what_changes(framings)
     framed = [framing.apply(photo.image) for photo, framing in zip(read, framings, strict=True)]
@@ -81,52 +72,13 @@ def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> Pr
                 poses.write(scene, names, framings)
             else:
                 write_photos(read, framings, Path(folder) / "photos")
-                names = run_colmap(Path(folder) / "photos", scene, [path.name for path in paths], findings)
+                names = _run_colmap(Path(folder) / "photos", scene, [path.name for path in paths], findings)
             if output.exists():
                 output.rmdir()
             os.replace(scene, output)
     except OSError as error:
         raise InputError(f"The scene can't be written to {output} ({error.strerror}); name another folder.") from error
     return PreparedScene(output, "nerfstudio-data" if poses is None else poses.parser, names)
-
-
-def _read_for_pose(path: Path, poses: Optional[Poses], index: int) -> Photo:
-    """A photo as its pose is for it: upright where it has none yet.
-
-    COLMAP and the readers of poses_bounds.npy and transforms.json take pixels as they are stored, whatever EXIF says,
-    so a pose from a file is for these; for the upright photo only where its shape leaves no other choice.
-
-    Raises:
-        InputError: its shape is not that of its pose.
-    """
-    if poses is None:
-        return read_photo(path)
-    stored, expected = read_photo(path, upright=False), poses.size(index)
-    if expected is None or fits(stored.image.size, expected):
-        return stored
-    turned = read_photo(path)
-    if fits(turned.image.size, expected):
-        return turned
-    width, height = stored.image.size
-    raise InputError(
-        f"{path} is {width} × {height} pixels, which is no scaled version of the {expected[0]} × {expected[1]} that "
-        f"its pose in {poses.path} is for; use the photo that the pose was found with."
-    )
-
-
-def _say_what_is_turned(photos: Sequence[Photo], poses: Optional[Poses]) -> None:
-    """Prints what was done with photos that aren't stored upright, a line for each way."""
-    told: Dict[str, List[str]] = {}
-    for photo in photos:
-        words = "turned upright, as EXIF says"
-        if not photo.upright:
-            words = f"not turned, though EXIF says so, since poses in {poses.path} are for photos as they are stored"
-        elif poses is not None:
-            words += f", since only then the shape is that of the pose in {poses.path}"
-        if photo.orientation != 1:
-            told.setdefault(words, []).append(photo.path.name)
-    for words, names in told.items():
-        print(f"{', '.join(names)}: {words}")
 
 
 def _say_what_changes(framings: Sequence[Framing]) -> None:
@@ -148,21 +100,8 @@ def _require_colmap(photos: Path) -> None:
         )
 
 
-def run_colmap(photos: Path, scene: Path, originals: Sequence[str], findings: Sequence[str]) -> List[str]:
-    """Has COLMAP find the poses, by way of ns-process-data, which writes the scene.
-
-    Args:
-        photos: folder of the photos, of one size.
-        scene: folder to write.
-        originals: the photos' own names, in the order of those in the folder.
-        findings: what is wrong with the photos.
-
-    Returns:
-        File names of the photos that have a pose.
-
-    Raises:
-        InputError: COLMAP found the place of fewer than three photos.
-    """
+def _run_colmap(photos: Path, scene: Path, originals: Sequence[str], findings: Sequence[str]) -> List[str]:
+    """Has COLMAP find the poses, by way of ns-process-data, which writes the scene, and returns its photos' names."""
     put_ffmpeg_on_path()
     program = shutil.which("ns-process-data") or str(Path(sys.executable).with_name("ns-process-data"))
     command = [

@@ -21,7 +21,7 @@ from sparsestyle_ns.rendering.look import Look, RenderMode
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes
 from sparsestyle_ns.runs.thumbnail import find_thumbnail
-from sparsestyle_ns.utils.names import free_name
+from sparsestyle_ns.utils.files import free_name
 from sparsestyle_ns.viewer.adjustments import begin_at_central_photo, hide_frustums, keep_outputs
 from sparsestyle_ns.viewer.baking import Baker
 from sparsestyle_ns.viewer.restyling_controls import Pace, RestylingControls, losses_text

@@ -22,7 +22,7 @@ from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.data.scene_info import NDC
 from sparsestyle_ns.effects.background import background_color
 from sparsestyle_ns.effects.base import EffectSettings
-from sparsestyle_ns.effects.exposure import build_exposure
+from sparsestyle_ns.effects.matched_colors import build_exposure
 from sparsestyle_ns.effects.matched_depth import matched_rays
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.effects.scene import Scene

@@ -21,11 +21,10 @@ from sparsestyle_ns.data.matches import (
     undistorted,
 )
 from sparsestyle_ns.data.reading import read_scene
-from sparsestyle_ns.effects.exposure import fit_gains, measure_exposure
 from sparsestyle_ns.effects.lens_distortion import largest_shift, measure_lens_distortion
+from sparsestyle_ns.effects.matched_colors import fit_gains, measure_exposure, measure_view_color
 from sparsestyle_ns.effects.matched_depth import measure_matched_depth, triangulate
 from sparsestyle_ns.effects.scene import Scene, border, read_rgba
-from sparsestyle_ns.effects.view_color import measure_view_color
 from sparsestyle_ns.utils.errors import InputError
 
 

@@ -11,7 +11,7 @@ import yaml
 from conftest import TINY, TINY_STYLE, decided, ns_train, only_run
 
 from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.effects.exposure import ExposureCorrection
+from sparsestyle_ns.effects.matched_colors import ExposureCorrection
 from sparsestyle_ns.effects.registry import EFFECTS, decided_on_photos
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.gallery.layout import RunPictures, gallery_page

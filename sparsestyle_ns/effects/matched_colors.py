@@ -1,4 +1,4 @@
-"""Photos that differ by a gain: exposure and white balance, three numbers a photo."""
+"""What the colours of matched points tell: photos' exposure and white balance, and colour that depends on the view."""
 
 from typing import Optional, Tuple
 
@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from sparsestyle_ns.data.matches import PointMatches, why_unmatched
-from sparsestyle_ns.effects.base import Decisions, Effect, Measurement
+from sparsestyle_ns.effects.base import Decisions, Measurement
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_STOPS = 0.1
@@ -19,6 +19,12 @@ DARK = 0.02
 """Added to colours before their ratio is taken, so that black doesn't count as infinitely dark."""
 ROBUST = 0.02
 """Log ratio below which differences count by their square, above by their size."""
+MIN_VIEWS = 6
+"""Photos below which shine can't be told from shape (docs/method.md)."""
+NOISE = 0.05
+"""Difference of matched colours, of a range of 1, that noise and inexact matches explain."""
+MIN_SHARE = 0.08
+"""Share of matched points that differ by more, from which on colour depends on the view."""
 
 
 def fit_gains(matches: PointMatches) -> Tuple[Float[np.ndarray, "views 3"], Float[np.ndarray, "matches 3"]]:
@@ -57,9 +63,6 @@ class ExposureCorrection(nn.Module):
     """A gain for each photo and channel, exp(g) with the mean of g over the photos at 0.
 
     That gauge makes the scene's own colours those of the mean exposure, which is what views without a photo show.
-
-    Args:
-        num_photos: how many.
     """
 
     def __init__(self, num_photos: int) -> None:
@@ -73,13 +76,7 @@ class ExposureCorrection(nn.Module):
     def forward(
         self, rgb: Float[Tensor, "rays 3"], behind: Float[Tensor, "rays 3"], photos: Int[Tensor, "rays"]
     ) -> Float[Tensor, "rays 3"]:
-        """What photos show of a scene: the light from it times the photo's gain, the background as it is.
-
-        Args:
-            rgb: the scene's own colours, background included.
-            behind: the background's part of them.
-            photos: which photo each ray belongs to.
-        """
+        """What photos show of a scene's colours: their light times the photo's gain, and the part `behind` as it is."""
         return (rgb - behind) * self.gains()[photos] + behind
 
     def undone(
@@ -105,4 +102,21 @@ def measure_exposure(scene: Scene) -> Measurement:
     return Measurement(stops >= MIN_STOPS, words, stops, MIN_STOPS)
 
 
-EXPOSURE = Effect("exposure", measure_exposure)
+def measure_view_color(scene: Scene) -> Measurement:
+    """The share of matched points whose colours differ by more than `NOISE`, exposure taken off.
+
+    On, the coarse field's colour head sees the view direction, as in Eq. 1.
+    """
+    matches, unknown = scene.matches, not_measurable(scene)
+    if unknown:
+        return Measurement(False, unknown, None, MIN_SHARE)
+    _, unexplained = fit_gains(matches)
+    # A log ratio r of two colours with the mean m is a difference of about r m.
+    differences = np.abs(unexplained) * (matches.colors.mean(axis=0) + DARK)
+    share = float((differences.mean(axis=-1) > NOISE).mean())
+    words, on = f"of {len(matches)} matched points change colour with the view", share >= MIN_SHARE
+    num_views = len(scene.cameras)
+    if on and num_views < MIN_VIEWS:
+        words += f", but {num_views} photos are too few to tell shine from shape; {MIN_VIEWS} are needed"
+        on = False
+    return Measurement(on, words, share, MIN_SHARE)
