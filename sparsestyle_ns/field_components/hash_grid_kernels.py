@@ -85,10 +85,8 @@ def gather(
 ) -> Float[Tensor, "points encoded"]:
     """ψ(x): on each level the weighted sum of the rows of the eight corners around a point.
 
-    Args:
-        table: on the CPU, float32 or float64; rows a level: a power of two.
-        positions: in [0, 1], of the table's type.
-        resolutions: cells along the cube's side, for each level.
+    Positions lie in [0, 1]; they and the table are float32 or float64. A level has a power of two of rows, and its
+    resolution is in cells along the cube's side.
     """
     levels, _, features = table.shape
     encoded = table.new_empty(len(positions), levels, features)

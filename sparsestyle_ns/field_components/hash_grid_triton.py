@@ -1,7 +1,6 @@
 """The hash grid on a CUDA device: rows, weights and sums in one kernel in either direction.
 
-The gradients of rows that several points share are added up atomically, in no fixed order: on a GPU the last bits of a
-gradient differ from run to run.
+Gradients of rows that several points share are added up atomically, in no fixed order: their last bits differ by run.
 """
 
 from typing import Tuple

@@ -123,7 +123,7 @@ class HierStyleModel(SceneModel):
             self.occupancy.measure(density, self.config.min_alpha, render.POINTS_PER_CALL)
 
     def freeze(self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]) -> FrozenSamples:
-        """The samples of rays that can show, with the coarse field evaluated there."""
+        """`freeze_samples` of rays for this model's own style."""
         with autocast(self.device, self.config.precision):
             segments = self.space.segments(origins, directions)
             return render.freeze_samples(self.field, self.residual, segments, self.marching)

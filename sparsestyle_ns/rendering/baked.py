@@ -215,7 +215,6 @@ def march_compiled(
 
 
 def _voxels(volume: BakedVolume, occupancy: Optional[Occupancy]) -> baked_kernels.Voxels:
-    """A volume in the kernels' form."""
     return baked_kernels.Voxels(
         np.ones((1, 1, 1), dtype=bool) if occupancy is None else occupancy.occupied.numpy(),
         volume.slots.numpy(),
@@ -226,7 +225,6 @@ def _voxels(volume: BakedVolume, occupancy: Optional[Occupancy]) -> baked_kernel
 
 
 def _lines(segments: Segments, marching: Marching) -> baked_kernels.Lines:
-    """Segments in the kernels' form."""
     spaced, bent = torch.zeros(2), isinstance(segments, spaces.ContractedSegments)
     if bent:
         parts = segments.origins, segments.directions

@@ -177,8 +177,6 @@ def march_rays(rays, start, end, lines, voxels, second, shares, min_transmittanc
     """Adds up the samples of `rays[start:end]`, as `render_packed` does.
 
     Args:
-        rays: indices of rays.
-        voxels: both fields.
         second: the same with another style, or None; what becomes of None is compiled without it.
         shares: of the style in the density and in the colour, and of the second style in the style (see `mixing`).
         sums: result, by ray: rgb, Σw and Σws of the mixed field, and the same of the coarse one.

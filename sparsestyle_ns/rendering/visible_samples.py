@@ -22,7 +22,6 @@ class Marching:
     occupancy: Optional[Occupancy]
     """Which cells of the cube are empty and skipped; None: none."""
     num_steps: int
-    """Even steps along a ray."""
     unbounded: bool
     """Whether the last step goes on to infinity."""
     min_transmittance: float

@@ -53,8 +53,8 @@ class Baker(threading.Thread):
         super().__init__(name="baking", daemon=True)
         self.model, self.shown, self.is_free, self.lock = model, shown, is_free, lock
         self.cameras = likely_cameras(cameras)
+        # The cameras whose rays have all been followed in a volume, for as long as the model keeps that.
         self.filled: WeakKeyDictionary[BakedVolume, Set[int]] = WeakKeyDictionary()
-        """The cameras whose rays have all been followed in a volume, for as long as the model keeps that."""
         self.ending = threading.Event()
 
     def run(self) -> None:
@@ -91,8 +91,7 @@ class Baker(threading.Thread):
 
     @torch.no_grad()
     def _follow(self, style: StylisedField, origins: Tensor, directions: Tensor) -> Optional[BakedVolume]:
-        """Fills what these rays meet, once there is time, and returns in which volume; None where the style isn't
-        shown any more, or it is to end."""
+        """Fills what these rays meet, once there is time; None instead of the volume where that has become useless."""
         while not self.is_free() and not self.ending.wait(0.1):
             pass
         if self.ending.is_set() or style not in self.shown():

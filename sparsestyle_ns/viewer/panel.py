@@ -42,8 +42,7 @@ MAX_SIDE_ON_CPU = 256
 class StylePanel(ViewerControl):
     """Controls of the style, in a folder of their own; they are made when a viewer is.
 
-    Controls change what the viewer's threads draw and nothing else: what is drawn in training and for evaluation, files
-    and videos is what the run's config says.
+    Controls change what the viewer's threads draw and nothing else: all other pictures are as the run's config says.
     """
 
     def __init__(self, pipeline: HierStylePipeline) -> None:
@@ -195,7 +194,6 @@ class StylePanel(ViewerControl):
         return min(time.time() - self.viewer.last_move_time, time.monotonic() - self._last_change)
 
     def _is_free(self) -> bool:
-        """Whether volumes may be filled ahead."""
         if self.mode.value != "baked" or self.restyling.is_busy:
             return False
         trainer = self.viewer.trainer

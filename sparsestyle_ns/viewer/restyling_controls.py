@@ -120,7 +120,6 @@ class RestylingControls:
         self._restyle(lambda: Painting.received(name, data))
 
     def _restyle(self, read: Callable[[], Painting]) -> None:
-        """Starts a restyling, or says why not."""
         if not self._busy.acquire(blocking=False):
             self.message.content = "One restyling at a time: wait for it, or stop it."
             return
@@ -141,7 +140,6 @@ class RestylingControls:
         self.thread.start()
 
     def _work(self, restyling: Restyling) -> None:
-        """Stylises, then shows what came out; the thread of one restyling."""
         try:
             with torch.enable_grad():
                 for progress in restyling:
