@@ -14,8 +14,7 @@ from sparsestyle_ns.engine.training import FusedAdamConfig
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
-from sparsestyle_ns.viewer.effects_panel import EffectsPanel
-from sparsestyle_ns.viewer.panel import StylePanel
+from sparsestyle_ns.viewer.panel import EffectsPanel, StylePanel
 
 
 def adam(lr: float, scheduler: Optional[SchedulerConfig] = None) -> Dict[str, Any]:

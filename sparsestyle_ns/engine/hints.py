@@ -50,12 +50,7 @@ def scene_arguments(config: TrainerConfig) -> List[str]:
     arguments += _changed_flags(config.pipeline.effects, EffectSettings(), "pipeline.effects.")
     arguments += flags_of("--output-dir", config.output_dir, Path("outputs"))
     arguments += flags_of("--vis", config.vis, "viewer+tensorboard")
-    return [
-        *arguments,
-        "--data",
-        str(manager.data or manager.dataparser.data),
-        *parser_arguments(manager.dataparser),
-    ]
+    return [*arguments, "--data", str(manager.data or manager.dataparser.data), *parser_arguments(manager.dataparser)]
 
 
 def parser_arguments(config: Any) -> List[str]:

@@ -144,7 +144,7 @@ class _StyleMeasure:
         if self.art_fid is not None:
             self.art_fid.add(stylised, photo)
         if self.baked:
-            with model.rendering("baked"):
+            with model.display.rendering("baked"):
                 values["baked_psnr"] = psnr(model.get_outputs_for_camera(camera)["rgb"], stylised)
         return values
 
@@ -153,7 +153,7 @@ def exact_outputs(model: Union[CoarseFewShotModel, HierStyleModel], camera: Came
     """A camera's outputs in exact rendering, whatever a stylised model's own mode is; a coarse one has no other."""
     if isinstance(model, CoarseFewShotModel):
         return model.get_outputs_for_camera(camera)
-    with model.rendering("exact"):
+    with model.display.rendering("exact"):
         return model.get_outputs_for_camera(camera)
 
 

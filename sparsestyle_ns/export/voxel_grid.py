@@ -79,7 +79,7 @@ def bake_voxels(model: HierStyleModel, resolution: int, cameras: Sequence[Camera
     volume = model.bake(resolution)
     for camera in track(cameras, "Finding what can be seen"):
         for segments in ray_segments(camera.to(model.device), model.space):
-            render_baked(volume, segments, model.marching, model.background)
+            render_baked([volume], segments, model.marching, model.background)
     filled = torch.ones(1, 1, 1, dtype=torch.bool, device=model.device)  # where nothing is known to be empty
     if model.occupancy is not None:
         filled = model.occupancy.occupied

@@ -47,7 +47,7 @@ def make_film(model: HierStyleModel, cameras: Cameras, frames: int, longest_side
     # H.264 keeps one colour for two by two pixels, so sides have to be even.
     path.width, path.height = path.width - path.width % 2, path.height - path.height % 2
     pictures = []
-    with model.rendering("baked"):
+    with model.display.rendering("baked"):
         for index in track(range(frames), "Filming"):
             outputs = model.get_outputs_for_camera(path[index : index + 1].to(model.device))
             pictures.append(as_pixels(outputs["rgb"].cpu().numpy()))

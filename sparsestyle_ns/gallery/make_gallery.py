@@ -170,9 +170,6 @@ def _settings(config: TrainerConfig, dataset: PhotoDataset, step: int) -> List[T
         ("Style image", "none" if pipeline.style_image is None else pipeline.style_image.name),
         ("Feature network", pipeline.backbone if pipeline.vgg_weights is None else pipeline.vgg_weights.name),
         ("Size it sees views at", f"{pipeline.feature_side} pixels"),
-        (
-            "Content weight λ",
-            f"{first:g} to {last:g} in {pipeline.content_steps} iterations",
-        ),
+        ("Content weight λ", f"{first:g} to {last:g} in {pipeline.content_steps} iterations"),
         ("Warm start", f"{pipeline.warm_start_steps} steps"),
     ]

@@ -87,7 +87,7 @@ class SceneViews:
     def _novel_view(self, camera: Cameras) -> ContentView:
         bundle = camera.generate_rays(camera_indices=0, keep_shape=True).to(self.model.device)
         rays = bundle.flatten()
-        with self.model.rendering("exact"):  # a viewer may restyle a run whose pictures are baked
+        with self.model.display.rendering("exact"):  # a viewer may restyle a run whose pictures are baked
             outputs = self.model.get_outputs_for_camera_ray_bundle(bundle)
         frozen = self._freeze(rays.origins, rays.directions)
         return ContentView(frozen, outputs["rgb_coarse"], outputs["accumulation_coarse"].squeeze(-1))

@@ -46,10 +46,7 @@ def measure_scene(dataparser: DataParserConfig, options: EffectsOptions) -> Deci
         InputError: something can't be read, or the run is of another scene.
     """
     config = FewShotDataManagerConfig(
-        data=options.data,
-        dataparser=copy.deepcopy(dataparser),
-        num_views=options.num_views,
-        view_ids=options.view_ids,
+        data=options.data, dataparser=copy.deepcopy(dataparser), num_views=options.num_views, view_ids=options.view_ids
     )
     manager = config.setup(device="cpu", test_mode="inference")
     scene = manager.scene
