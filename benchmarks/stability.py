@@ -81,7 +81,7 @@ def attempt(config: Any, coarse: Optional[CoarseRun], rate: float, iterations: i
     training = Training(config, device, None if coarse is None else coarse.model_state())
     losses = [training.step().item() for _ in range(iterations)]
     last = losses[-max(1, round(LAST * iterations)) :]
-    return Trial(rate, sum(last) / len(last), training.optimizers.skipped().total)
+    return Trial(rate, sum(last) / len(last), training.optimizers.skipped()[0])
 
 
 @exit_on_input_error

@@ -21,7 +21,7 @@ from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.evaluation.held_out import stylisation_figures
 from sparsestyle_ns.losses.base import PaintingFeatures, StylizationLoss, StylizedView
 from sparsestyle_ns.losses.stylization import LOSSES
-from sparsestyle_ns.metrics.gram import gram_matrix
+from sparsestyle_ns.metrics.image import gram_matrix
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 from sparsestyle_ns.runs.coarse_run import read_coarse_run

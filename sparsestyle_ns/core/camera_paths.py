@@ -1,8 +1,7 @@
-"""Paths of cameras that follow from the training cameras: to measure consistency on, to show a scene, to add views."""
+"""How a scene was captured, and paths of cameras that follow from it; a pose's columns: right, up, back, position."""
 
 import itertools
 import math
-from typing import List
 
 import torch
 from jaxtyping import Float
@@ -11,26 +10,43 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from sparsestyle_ns.core.camera_geometry import is_forward_facing, meeting_point
 from sparsestyle_ns.utils.errors import InputError
 
-NUM_FRAMES = 24
-"""Frames of the path, at least."""
-ARC_STEP = math.radians(2.0)
-"""Angle between neighbouring frames of an arc."""
+MAX_SPREAD = 45.0
+"""Degrees by which a camera of a forward-facing capture may look aside from the mean viewing direction."""
+NUM_FRAMES, ARC_STEP = 24, math.radians(2.0)
+"""Frames of the measuring path, at least, and the angle between those of an arc."""
 FLIGHT_STEPS = 20
 """Poses of a flight that a frame chooses from, so that its speed can change without jerks."""
 
 
+def viewing_spread(poses: Float[Tensor, "cameras 3 4"]) -> float:
+    """Largest angle, in degrees, between a camera's viewing direction and the mean of all; 180 where they cancel."""
+    directions = normalize(-poses[:, :, 2].double(), dim=-1)
+    mean = directions.mean(dim=0)
+    if mean.norm() < 1e-6:
+        return 180.0
+    return float((directions @ normalize(mean, dim=0)).clamp(-1.0, 1.0).acos().max().rad2deg())
+
+
+def is_forward_facing(poses: Float[Tensor, "cameras 3 4"]) -> bool:
+    """Whether all cameras look one way, within 45 degrees (`MAX_SPREAD`) of their mean direction: NDC is for those."""
+    return viewing_spread(poses) <= MAX_SPREAD
+
+
+def meeting_point(poses: Float[Tensor, "cameras 3 4"]) -> Float[Tensor, "3"]:
+    """The point nearest to all viewing axes, by least squares; of parallel axes, the one nearest to the origin."""
+    axes = normalize(poses[:, :, 2].double(), dim=-1)
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    target = (across @ poses[:, :, 3:].double()).sum(dim=0)
+    return (torch.linalg.pinv(across.sum(dim=0), hermitian=True) @ target)[:, 0].to(poses.dtype)
+
+
 def measuring_path(cameras: Cameras) -> Cameras:
-    """The path on which consistency is measured, one camera a frame.
+    """The path on which consistency is measured, one camera a frame; an `InputError` for fewer than two cameras.
 
-    Where the training cameras look one way, it leads from each to the next in their order, in steps of equal parts;
-    where they stand all around, it is an arc around the point that they look at, level with them on average, in steps
-    of 2° from the first one's side on.
-
-    Raises:
-        InputError: there are fewer than two training cameras.
+    Where the training cameras look one way, it leads from each to the next in equal steps; where they stand all around,
+    it is an arc around the point that they look at, level with them on average, in steps of 2° from the first one on.
     """
     if len(cameras) < 2:
         raise InputError("Consistency is measured between training views, and there is one; train on two or more.")
@@ -39,11 +55,7 @@ def measuring_path(cameras: Cameras) -> Cameras:
 
 
 def showing_path(cameras: Cameras, frames: int) -> Cameras:
-    """A closed path that shows a scene, one camera a frame; the last frame is just before the first.
-
-    Where the two or more training cameras look one way, a flight through them there and back, which is slow where it
-    turns; where they stand all around, one full turn as in `unseen_places`.
-    """
+    """A closed path, one camera a frame: through the cameras and back, slow where it turns, or one turn around all."""
     poses = cameras.camera_to_worlds.cpu().float()
     if not is_forward_facing(poses):
         return unseen_places(cameras, frames)
@@ -53,11 +65,7 @@ def showing_path(cameras: Cameras, frames: int) -> Cameras:
 
 
 def unseen_places(cameras: Cameras, count: int) -> Cameras:
-    """So many cameras (a few more on a way) at equal steps where photos might have been taken.
-
-    Where the two or more training cameras look one way, on the way from each to the next in their order; where they
-    stand all around, on the circle about the point that they look at, level with them on average.
-    """
+    """`count` cameras or a few more, at equal steps: from each training camera to the next, or on the circle of all."""
     # In float64, whose rounding, which differs with where vectors lie in memory, doesn't reach the float32 result.
     poses = cameras.camera_to_worlds.cpu().double()
     if is_forward_facing(poses):
@@ -77,7 +85,7 @@ def at_poses(poses: Float[Tensor, "frames 3 4"], cameras: Cameras) -> Cameras:
 def poses_between(poses: Float[Tensor, "cameras 3 4"], frames: int = NUM_FRAMES) -> Float[Tensor, "all 3 4"]:
     """Poses from each camera to the next; equally many, `frames` at least in all, in each gap."""
     steps = -(-(frames - 1) // (len(poses) - 1))
-    path: List[Tensor] = [poses[0]]
+    path = [poses[0]]
     for first, second in itertools.pairwise(poses):
         between = get_interpolated_poses(first.numpy(), second.numpy(), steps + 1)
         path += [torch.tensor(pose[:3], dtype=poses.dtype) for pose in between[1:]]

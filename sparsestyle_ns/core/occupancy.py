@@ -1,8 +1,4 @@
-"""A grid that remembers how dense each part of the cube is, so that samples go where something is.
-
-In stage 1 it follows the field as it learns: a ray's samples are placed by the weights that the remembered densities
-give. Once the coarse field is frozen, it says which cells are empty.
-"""
+"""Grids that remember what each part of the cube holds, so that samples go where something is."""
 
 from typing import Callable, NamedTuple, Optional
 
@@ -35,7 +31,7 @@ def grid_cells(positions: Float[Tensor, "*batch 3"], resolution: int) -> Int[Ten
 
 
 class DensityGrid(nn.Module):
-    """σ per cell of the cube [−1, 1]³, `resolution` cells a side; `initial` before anything is known."""
+    """σ per cell of the cube, `resolution` a side, of a field that learns; `initial` before anything is known."""
 
     density: Float[Tensor, "cells"]
 
@@ -45,7 +41,7 @@ class DensityGrid(nn.Module):
         self.register_buffer("density", torch.full((resolution**3,), initial))
 
     def cells(self, positions: Float[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
-        """The cell each position lies in; positions outside the cube belong to the nearest cell."""
+        """The cell each position lies in."""
         index = grid_cells(positions, self.resolution)
         return (index[..., 0] * self.resolution + index[..., 1]) * self.resolution + index[..., 2]
 
@@ -53,13 +49,11 @@ class DensityGrid(nn.Module):
     def remember(
         self, positions: Float[Tensor, "*batch 3"], density: Float[Tensor, "*batch"], decay: float = 0.8
     ) -> None:
-        """Takes note of densities seen at positions: the larger of them and `decay` times what the cell had.
-
-        A density that isn't finite is no news: the step it comes from is skipped, but what the grid holds would stay.
-        """
+        """Takes note of densities seen at positions: the larger of them and `decay` times what the cell had."""
         cells = self.cells(positions).reshape(-1)
         seen = density.detach().reshape(-1).to(self.density)
         self.density[cells] *= decay
+        # The step that a density which isn't finite comes from is skipped, but what the grid holds would stay.
         self.density.scatter_reduce_(0, cells, seen.where(seen.isfinite(), 0.0), reduce="amax")
 
     @torch.no_grad()
@@ -72,14 +66,9 @@ class DensityGrid(nn.Module):
         even_share: float,
         generator: Optional[torch.Generator] = None,
     ) -> Float[Tensor, "rays edges"]:
-        """Borders of `num_samples` samples on each ray, dense where the remembered density is seen from the camera.
+        """Borders of samples on each ray, dense where the remembered density is seen from the camera.
 
-        The histogram is what volume rendering of the remembered densities on `num_bins` even bins gives, each bin
-        widened to its neighbours, plus an even share so that no part of a ray is forgotten.
-
-        Args:
-            even_share: part of the mass in (0, 1] that is spread evenly.
-            generator: moves borders at random; None gives a fixed placement.
+        They follow its weights on even bins, of which a share in (0, 1] is spread evenly; a `generator` moves them.
         """
         rays = len(segments.hit)
         edges = even_edges(rays, num_bins, self.density.device, generator)
@@ -110,37 +99,29 @@ class Occupancy(nn.Module):
     def measure(
         self, density: Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]], min_alpha: float, chunk: int
     ) -> None:
-        """Marks the cells in which a ray would meet an opacity of at least `min_alpha`, and their neighbours.
-
-        Opacity is 1 − exp(−σ · cell side) at the cell's centre; `density` gives σ of at most `chunk` points at once.
-        """
+        """Marks the cells with 1 − exp(−σ · cell side) above `min_alpha` at their centre, and their neighbours."""
         side = 2.0 / self.resolution
         axis = (torch.arange(self.resolution, device=self.occupied.device) + 0.5) * side - 1.0
         alphas = []
-        layers = max(1, chunk // self.resolution**2)
-        for xs in axis.split(layers):
+        for xs in axis.split(max(1, chunk // self.resolution**2)):
             points = torch.stack(torch.meshgrid(xs, axis, axis, indexing="ij"), dim=-1)
             alphas.append(-torch.expm1(-density(points.reshape(-1, 3)) * side).view(points.shape[:-1]))
-        occupied = (torch.cat(alphas) > min_alpha).to(torch.uint8)
-        self.occupied.copy_(F.max_pool3d(occupied.float()[None], kernel_size=3, stride=1, padding=1)[0] > 0)
+        occupied = (torch.cat(alphas) > min_alpha).float()
+        self.occupied.copy_(F.max_pool3d(occupied[None], kernel_size=3, stride=1, padding=1)[0] > 0)
 
     def contains(self, positions: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
-        """Whether positions lie in occupied cells; positions outside the cube belong to the nearest cell."""
+        """Whether positions lie in occupied cells."""
         index = grid_cells(positions, self.resolution)
         return self.occupied[index[..., 0], index[..., 1], index[..., 2]]
 
 
 class PackedSamples(NamedTuple):
-    """Samples of a batch of rays in the packed layout (see `volrend`)."""
+    """Samples in the packed layout (see `volrend`): middles of intervals, s in [0, 1] and positions, and lengths δ."""
 
     ray_indices: Int[Tensor, "samples"]
-    """The ray each sample lies on, ascending; front to back on a ray."""
     s: Float[Tensor, "samples"]
-    """Middle of its interval, in [0, 1]."""
     lengths: Float[Tensor, "samples"]
-    """δ in field coordinates; infinite for the last interval of an unbounded space."""
     positions: Float[Tensor, "samples 3"]
-    """Field coordinates of the middle."""
 
     def select(self, keep: Tensor) -> "PackedSamples":
         """Some of the samples, in order, by mask or ascending indices."""
@@ -149,10 +130,7 @@ class PackedSamples(NamedTuple):
 
 @torch.no_grad()
 def march(segments: Segments, occupancy: Optional[Occupancy], num_steps: int, unbounded: bool) -> PackedSamples:
-    """The samples of `num_steps` even steps along each ray that lie in occupied cells; all without an `occupancy`.
-
-    In an unbounded space the last step is always kept: its interval goes on to infinity.
-    """
+    """The samples of even steps along each ray that lie in occupied cells, and an unbounded space's last one."""
     edges = even_edges(len(segments.hit), num_steps, segments.hit.device)
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
     positions = segments.positions(middle)

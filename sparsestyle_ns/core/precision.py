@@ -14,15 +14,18 @@ P = ParamSpec("P")
 R = TypeVar("R")
 Precision = Literal["auto", "float32", "tf32", "bfloat16"]
 """auto: bfloat16 where the device multiplies it, else float32. tf32: NVIDIA's 19-bit format, in forward passes and from
-Ampere on; elsewhere the same as float32."""
+Ampere on; elsewhere as float32."""
+
+
+def multiplies_tf32(device: torch.device) -> bool:
+    """Whether the device has instructions for TF32 matrix products."""
+    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
 
 
 def multiplies_bfloat16(device: torch.device) -> bool:
     """Whether the device has instructions for bfloat16 matrix products, which makes them faster than float32 ones."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_capability(device) >= (8, 0)
     if device.type != "cpu":
-        return False
+        return multiplies_tf32(device)  # both came with Ampere
     probes = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
     return any(getattr(torch.cpu, probe, bool)() for probe in probes)
 
@@ -35,21 +38,12 @@ def autocast(device: torch.device, precision: Precision) -> AbstractContextManag
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=enabled)
 
 
-def multiplies_tf32(device: torch.device) -> bool:
-    """Whether the device has instructions for TF32 matrix products."""
-    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
-
-
 _lock, _within, _before = threading.Lock(), 0, False
 
 
 @contextmanager
 def _tf32_products() -> Iterator[None]:
-    """Turns on torch's switch for TF32 products, of which there is one for all threads; afterwards it is as before.
-
-    It is on while any thread is within. What another thread multiplies outside meanwhile, such as a backward pass
-    beside a viewer's picture, is multiplied in TF32 too.
-    """
+    """Turns on torch's switch for TF32 products while any thread is within; all threads have the one switch."""
     global _within, _before
     products = torch.backends.cuda.matmul
     with _lock:

@@ -1,7 +1,4 @@
-"""Where along a ray samples go: even borders, and borders that follow a histogram of weights.
-
-s is the normalised distance along the part of a ray that lies in the scene: 0 at its start, 1 at its end.
-"""
+"""Where along a ray samples go; s is 0 at the start of its part that lies in the scene, and 1 at the end."""
 
 from typing import Optional
 
@@ -14,10 +11,7 @@ from torch import Tensor
 def even_edges(
     num_rays: int, num_samples: int, device: torch.device, generator: Optional[torch.Generator] = None
 ) -> Float[Tensor, "rays edges"]:
-    """`num_samples` + 1 ascending borders in [0, 1] on each ray.
-
-    Even ones, or with a generator moved by up to half a step each, but for the first and last (stratified sampling).
-    """
+    """`num_samples` + 1 ascending borders in [0, 1]; a generator moves inner ones by up to half a step (stratified)."""
     if generator is None:
         return torch.linspace(0.0, 1.0, num_samples + 1, device=device).expand(num_rays, -1)
     jitter = torch.rand(num_rays, num_samples - 1, device=device, generator=generator) - 0.5
@@ -34,12 +28,8 @@ def sample_pdf(
 ) -> Float[Tensor, "rays edges"]:
     """`num_samples` + 1 borders that cut a histogram into parts of equal mass (NeRF, Sec. 5.2, by inverse CDF).
 
-    The first border is the histogram's start and the last its end, so that the samples cover the whole ray.
-
-    Args:
-        edges: ascending borders of the histogram's bins.
-        weights: mass of each bin, ≥ 0, with a positive sum on every ray.
-        generator: moves inner borders by up to half a part of mass.
+    The first border is the histogram's start and the last its end. Weights, the mass of each bin between its ascending
+    `edges`, are ≥ 0, with a positive sum on every ray; a `generator` moves inner borders by up to half a part of mass.
     """
     mass = torch.cumsum(weights, dim=-1)
     cdf = torch.cat([torch.zeros_like(mass[:, :1]), mass / mass[:, -1:]], dim=-1)

@@ -1,4 +1,4 @@
-"""How strongly a loss counts at an iteration: content while a scene is stylised, regularisers that set in later."""
+"""How strongly a loss counts at an iteration."""
 
 import math
 
@@ -6,19 +6,9 @@ from sparsestyle_ns.utils.errors import InputError
 
 
 def content_weight(step: int, initial: float, decay: float, duration: int) -> float:
-    """The weight λ of the content loss at one iteration (Eq. 6).
+    """The weight λ(t) of the content loss, λ0 · α^(t/T) while t ≤ T, and λ0 · α from then on (Eq. 6).
 
-    λ(t) = λ0 · α^(t/T) while t ≤ T, and λ0 · α from then on: an exponential fall from λ0 to λ0 · α. With T = 0
-    the fall is already over, so λ is λ0 · α from the first iteration on, t = 0 included.
-
-    Args:
-        step: the iteration t, counted from 0.
-        initial: λ0 ≥ 0, the weight at t = 0; the paper's is 10.
-        decay: α ≥ 0, what is left of the weight at the end; the paper's is 0.01, 1 keeps the weight constant.
-        duration: T ≥ 0, the iterations the fall takes; the paper's is 100.
-
-    Raises:
-        InputError: an argument is negative, infinite or not a number.
+    `step` is t ≥ 0. λ0, α and T are 0 or more, or an `InputError` says so; the paper's are 10, 0.01 and 100.
 
     Example:
         >>> content_weight(step=50, initial=10.0, decay=0.01, duration=100)
@@ -28,20 +18,11 @@ def content_weight(step: int, initial: float, decay: float, duration: int) -> fl
     for name, value in arguments.items():
         if not 0 <= value < math.inf:
             raise InputError(f"The content weight's {name} is {value}: give a finite number that is 0 or more.")
-    if step >= duration:
-        return initial * decay
-    return initial * decay ** (step / duration)
+    return initial * decay ** (step / duration if step < duration else 1)
 
 
 def ramp(progress: float, start: float, length: float) -> float:
-    """A share that rises evenly from 0 at `start` to 1 at `start + length`; a step where `length` is 0.
-
-    All three are shares of the iterations, 0 or more.
-
-    Example:
-        >>> ramp(0.5, start=0.25, length=0.5)
-        0.5
-    """
+    """Rises evenly from 0 at `start` to 1 at `start + length`, shares of the iterations; a step where `length` is 0."""
     since = progress - start
     if since >= length:
         return 1.0

@@ -1,7 +1,5 @@
 """Which part of space a scene lies in, and how it is laid into the cube [−1, 1]³ that the fields live in.
 
-Three spaces cover the scenes that nerfstudio's dataparsers give: *forward-facing* (NDC: everything from a near plane to
-infinity), *box* (an object in an axis-aligned box) and *contracted* (cameras all around, background at any distance).
 A space turns rays into segments; s in [0, 1] goes from a segment's start to its end. Density is per unit of length in
 the cube, so that the scale of the world's coordinates doesn't matter.
 """
@@ -19,8 +17,7 @@ from torch import Tensor, nn
 from sparsestyle_ns.core.ndc import ndc_distance, ndc_parameter, ndc_rays
 
 MAX_DISTANCE = 1e4
-"""The distance that stands for infinity in depth maps, in units of the scene: of the near plane's distance in a
-forward-facing space, of the contraction's unit in a contracted one."""
+"""Stands for infinity in depth maps, in units of the near plane's distance or of the contraction's unit."""
 
 
 class Segments(ABC):
@@ -102,10 +99,7 @@ class _BoxSegments(LinearSegments):
 
 @dataclass
 class ContractedSegments(Segments):
-    """Segments of world rays, bent by the contraction; s is linear up to distance 1 and in disparity beyond.
-
-    Origins and `near` are in multiples of `unit`, a length in the world.
-    """
+    """Segments of world rays, bent by the contraction; origins and `near` are in multiples of `unit`, in the world."""
 
     origins: Float[Tensor, "rays 3"]
     directions: Float[Tensor, "rays 3"]
@@ -118,16 +112,15 @@ class ContractedSegments(Segments):
         return self.unit * self._distance_in_units(s)
 
     def _distance_in_units(self, s: Tensor) -> Tensor:
-        start, end = self._ends
-        return inverse_spacing(start.to(s) + s * (end - start).to(s))
+        start, end = self._ends(s)
+        return inverse_spacing(start + s * (end - start))
 
-    @property
-    def _ends(self) -> Tuple[Tensor, Tensor]:
-        return spacing(torch.tensor(self.near)), spacing(torch.tensor(MAX_DISTANCE))
+    def _ends(self, like: Tensor) -> Tuple[Tensor, Tensor]:
+        return spacing(like.new_tensor(self.near)), spacing(like.new_tensor(MAX_DISTANCE))
 
     def at_distance(self, distance: Tensor) -> Tensor:
         """See `Segments.at_distance`."""
-        return _position_between(spacing(distance / self.unit), *(end.to(distance) for end in self._ends))
+        return _position_between(spacing(distance / self.unit), *self._ends(distance))
 
     def positions(self, s: Tensor, ray_indices: Optional[Tensor] = None) -> Tensor:
         """See `Segments.positions`."""
@@ -163,10 +156,7 @@ def inverse_spacing(spaced: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 
 def contract(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Points into [−1, 1]³: x/2 within the unit cube, (1 − 1/(2|x|)) x/|x| outside, |·| the largest coordinate.
-
-    It is the contraction of mip-NeRF 360 (Eq. 10) with the maximum norm, halved.
-    """
+    """x/2 within the unit cube, (1 − 1/(2|x|)) x/|x| outside: mip-NeRF 360's (Eq. 10) with the maximum norm, halved."""
     norm = points.abs().amax(dim=-1, keepdim=True).clamp(min=1.0)
     # Equal to x/2 at norm 1, and so everywhere within the cube. x/|x| comes first: the largest x has no double.
     return (1.0 - 0.5 / norm) * (points / norm)
@@ -181,8 +171,7 @@ def intersect_box(
 ) -> Tuple[Float[Tensor, "rays 1"], Float[Tensor, "rays 1"], Bool[Tensor, "rays"]]:
     """Distances at which rays enter and leave an axis-aligned box, and whether they meet it (the slab method).
 
-    Rays start no closer than `near`, so that a camera may stand in the box. Where they miss it, both distances are
-    `near`.
+    Rays start no closer than `near`; where they miss the box, both distances are `near`.
     """
     tiny = torch.finfo(directions.dtype).tiny
     safe = torch.where(directions.abs() < tiny, torch.full_like(directions, tiny), directions)
@@ -205,17 +194,14 @@ class Space(nn.Module, ABC):
 
 
 class ForwardFacingSpace(Space):
-    """Normalised device coordinates (NeRF, appendix C), for cameras that all look one way.
-
-    Depth d lies at z' = 1 − 2 near/d. Samples lie between the two depths of `depth_range`; the last one's interval goes
-    on to infinity. Knowing how far away the farthest thing is matters with few photos: all that lies at infinity looks
-    the same from everywhere, so that a field which puts a whole photo there is hard to dislodge.
+    """Normalised device coordinates (NeRF, appendix C), for cameras that all look one way: depth d at 1 − 2 near/d.
 
     Args:
         box: NDC box that holds all views' frusta; between the depths it becomes the cube.
         focal_over_half_size: 2f/width and 2f/height.
         near: distance of the near plane in world units.
-        depth_range: depth of the nearest and of the farthest thing, in world units; None for all from `near` on.
+        depth_range: depths in world units between which samples lie; None for all from `near` on. What lies at infinity
+            looks the same from everywhere: with few photos, a field that puts a whole photo there is hard to dislodge.
     """
 
     unbounded = True
@@ -246,23 +232,13 @@ class ForwardFacingSpace(Space):
         hit = (valid & (first < last)).squeeze(-1)
         size = self.maximum - self.minimum
         scale = 2.0 / torch.where(size > 0, size, 2.0)
-        return _ForwardFacingSegments(
-            start=(start + first * extent - self.minimum) * scale - 1.0,
-            extent=(last - first) * extent * scale * hit[:, None],
-            hit=hit,
-            origins=origins,
-            directions=directions,
-            near=self.near,
-            first=first,
-            last=last,
-        )
+        start = (start + first * extent - self.minimum) * scale - 1.0
+        extent = (last - first) * extent * scale * hit[:, None]
+        return _ForwardFacingSegments(start, extent, hit, origins, directions, self.near, first, last)
 
 
 class BoxSpace(Space):
-    """An axis-aligned box in world coordinates, for an object with nothing behind it; its longest side is the cube's.
-
-    Rays start no closer to the camera than `near`, in half sides of the cube.
-    """
+    """An axis-aligned box in the world, whose longest side is the cube's; rays start at `near`, in half sides of it."""
 
     unbounded = False
 
@@ -278,21 +254,13 @@ class BoxSpace(Space):
         size = self.maximum - self.minimum
         scale = 2.0 / size.amax()
         near, far, hit = intersect_box(origins, directions, self.minimum, self.maximum, self.near / scale)
-        return _BoxSegments(
-            start=(origins + near * directions - center) * scale,
-            extent=(far - near) * directions * scale,
-            hit=hit,
-            near=near,
-            far=far,
-            beyond=(origins - center).norm(dim=-1, keepdim=True) + 0.5 * size.norm(),
-        )
+        start = (origins + near * directions - center) * scale
+        beyond = (origins - center).norm(dim=-1, keepdim=True) + 0.5 * size.norm()
+        return _BoxSegments(start, (far - near) * directions * scale, hit, near, far, beyond)
 
 
 class ContractedSpace(Space):
-    """All of space, contracted, for cameras all around and a background beyond them.
-
-    Coordinates below `unit`, a length in the world above 0, aren't bent. Rays start at `near` of that unit.
-    """
+    """All of space, bent beyond `unit`, a length in the world above 0, of which rays start at `near`."""
 
     unbounded = True
 

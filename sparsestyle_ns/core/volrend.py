@@ -3,12 +3,9 @@
 Letters, as in NeRF (Sec. 4) and the paper: σ_i density of sample i, δ_i length of its interval, τ_i = σ_i δ_i its
 optical depth, T_i = exp(−Σ_{j<i} τ_j) the transmittance in front of it, w_i = T_i (1 − exp(−τ_i)) its weight.
 
-Samples come in two layouts. *Dense*: [rays, samples], every ray has as many samples. *Packed*: the samples of all rays
-one after another, front to back, sample i belonging to ray `ray_indices[i]` (ascending); rays may have none. Packed is
-the layout in which empty space costs nothing.
-
-Depths, transmittances and weights have at least float32's digits, also where densities have fewer, as under autocast:
-sums of thousands of samples need them.
+Samples come in two layouts. *Dense*: [rays, samples]. *Packed*: the samples of all rays one after another, front to
+back, sample i belonging to ray `ray_indices[i]` (ascending); rays may have none, and empty space costs nothing.
+Depths, transmittances and weights have at least float32's digits: sums of thousands of samples need them.
 """
 
 from typing import Tuple
@@ -29,8 +26,8 @@ interval is infinite."""
 def optical_depth(density: Float[Tensor, "*batch"], interval: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """τ = σ δ, capped at `MAX_OPTICAL_DEPTH`.
 
-    An infinite interval gives the cap, and 0 where the density is 0. Its gradient is that of an interval of length 1:
-    the true one, infinite at σ = 0, would drown all others once a last sample has been emptied.
+    An infinite interval gives the cap, or 0 where σ = 0, and the gradient of an interval of length 1: the true one,
+    infinite at σ = 0, would drown all others once a last sample has been emptied.
     """
     density, interval = at_least_float32(density), at_least_float32(interval)
     infinite = interval.isinf()
@@ -70,12 +67,9 @@ class _DenseWeights(torch.autograd.Function):
 def packed_transmittance(
     depth: Float[Tensor, "samples"], ray_indices: Int[Tensor, "samples"], num_rays: int
 ) -> Float[Tensor, "samples"]:
-    """T_i = exp(−Σ τ_j over the samples in front of i on the same ray), packed layout.
-
-    The running sum goes over all rays in float64, and each ray's start is taken off: with τ capped, the error of that
-    difference stays below 1e-6 for ten million samples.
-    """
+    """T_i = exp(−Σ τ_j over the samples in front of i on the same ray), packed layout."""
     depth = at_least_float32(depth)
+    # In float64, with τ capped, the error of a difference of two sums over all rays stays below 1e-6.
     before = F.pad(torch.cumsum(depth.double(), dim=0), (1, 0))
     counts = torch.bincount(ray_indices, minlength=num_rays)
     in_front = before[:-1] - before[torch.cumsum(counts, dim=0) - counts][ray_indices]
@@ -90,7 +84,7 @@ def packed_weights(
 
 
 class _PackedWeights(torch.autograd.Function):
-    """The twin of `_DenseWeights`; sums over what lies behind a sample run as in `packed_transmittance`."""
+    """The twin of `_DenseWeights`, with sums as in `packed_transmittance`."""
 
     @staticmethod
     def forward(ctx, depth: Tensor, ray_indices: Tensor, num_rays: int) -> Tensor:
@@ -118,10 +112,7 @@ def packed_sum(
 
 
 def effective_samples(weights: Float[Tensor, "*rays samples"]) -> Float[Tensor, "*rays"]:
-    """(Σw)² / Σw²: on how many samples a ray's weight lies. 1 is a surface, the number of samples is a fog.
-
-    A ray without any weight counts as 0.
-    """
+    """(Σw)² / Σw²: on how many samples a ray's weight lies, 1 for a surface, many for a fog, 0 without any weight."""
     tiny = torch.finfo(weights.dtype).tiny
     # Squares of shares, unlike those of weights, don't underflow where all weights are small.
     shares = weights / weights.sum(dim=-1, keepdim=True).clamp(min=tiny)
@@ -131,10 +122,8 @@ def effective_samples(weights: Float[Tensor, "*rays samples"]) -> Float[Tensor, 
 def distortion(weights: Float[Tensor, "*rays samples"], edges: Float[Tensor, "*rays edges"]) -> Float[Tensor, "*rays"]:
     """Distortion of a ray's weights: Σ_ij w_i w_j |m_i − m_j| + ⅓ Σ w_i² (s_{i+1} − s_i) (mip-NeRF 360, Eq. 15).
 
-    It is small when the weight lies in one place. Between two neighbouring middles passes each pair of weights of which
-    one is on either side: Σ_ij w_i w_j |m_i − m_j| = 2 Σ_k (m_{k+1} − m_k) (Σ_{i≤k} w_i) (Σ_{i>k} w_i). That takes
-    linear time, and no term of it is negative, so that none of them cancel. Edges are the samples' ascending borders s,
-    normalised to [0, 1] by the caller.
+    In linear time, without terms that cancel: the first sum is 2 Σ_k (m_{k+1} − m_k) (Σ_{i≤k} w_i) (Σ_{i>k} w_i). Edges
+    are the samples' ascending borders s in [0, 1], m their middles.
     """
     mass = torch.cumsum(weights, dim=-1)
     before, behind = mass[..., :-1], mass[..., -1:] - mass[..., :-1]

@@ -4,7 +4,7 @@ from typing import Optional
 
 from nerfstudio.data.scene_box import SceneBox
 
-from sparsestyle_ns.core.camera_geometry import MAX_SPREAD, is_forward_facing, meeting_point, viewing_spread
+from sparsestyle_ns.core.camera_paths import MAX_SPREAD, is_forward_facing, meeting_point, viewing_spread
 from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace, Space
 from sparsestyle_ns.data.scene_info import NDC
 from sparsestyle_ns.effects.base import Decisions, Measurement

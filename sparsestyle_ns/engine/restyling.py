@@ -29,8 +29,7 @@ from sparsestyle_ns.style.backbone import Backbone
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.distributed import num_processes
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.files import write_whole
-from sparsestyle_ns.utils.names import safe_file_name
+from sparsestyle_ns.utils.files import safe_file_name, write_whole
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 
 SEED = 42

@@ -233,7 +233,7 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def _look_at_skipped(self, step: int) -> int:
         """Reports steps that were skipped since the last look; returns how many were in a row up to now."""
-        total = self.optimizers.skipped().total
+        total, _ = self.optimizers.skipped()
         if total > self._reported:
             new = f"{total - self._reported} ({total} in all)"
             CONSOLE.print(f"Steps skipped up to iteration {step + 1}, because their gradients weren't finite: {new}.")

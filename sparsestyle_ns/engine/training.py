@@ -81,7 +81,7 @@ def check_skipped(optimizers: FiniteOptimizers, most: int, step: int, advice: st
 
     InputError, ending with `advice`, where there are `most` or more.
     """
-    in_a_row = optimizers.skipped().in_a_row
+    _, in_a_row = optimizers.skipped()
     if in_a_row >= most:
         raise InputError(
             f"Training stopped after iteration {step + 1}, because the gradients of the last {in_a_row} weren't "

@@ -22,8 +22,7 @@ from sparsestyle_ns.core.volrend import dense_weights, effective_samples, optica
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID
 from sparsestyle_ns.metrics.consistency import RANGES, PathGeometry
-from sparsestyle_ns.metrics.gram import gram_distance, gram_matrix
-from sparsestyle_ns.metrics.image import image_metrics, psnr
+from sparsestyle_ns.metrics.image import gram_distance, gram_matrix, image_metrics, psnr
 from sparsestyle_ns.metrics.warping import MIN_COVERAGE, Pinhole, Surface
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
@@ -168,7 +167,7 @@ def stylisation_figures(
     """How strong the style of a view is, before (`…_before`) and after stylising, and how far its content has moved.
 
     `style_loss` and `content_loss` are Eq. 5's: nearest neighbour feature matching, and the features' distance from the
-    unstylised view; other losses of `targets` are `NAME_loss`, and `gram_distance` is that of `metrics.gram`. With
+    unstylised view; other losses of `targets` are `NAME_loss`, and `gram_distance` is that of `metrics.image`. With
     `accumulation`, only where the scene covers the picture: a background can't be stylised.
     """
     content = targets.features(coarse)

@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 
-from sparsestyle_ns.core.camera_geometry import is_forward_facing
-from sparsestyle_ns.core.camera_paths import showing_path
+from sparsestyle_ns.core.camera_paths import is_forward_facing, showing_path
 from sparsestyle_ns.gallery.layout import Film
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.utils.errors import InputError

@@ -8,7 +8,7 @@ import tyro
 
 from sparsestyle_ns.runs.run_folder import STYLE_METHOD, find_config
 from sparsestyle_ns.utils.errors import CommandOptions, InputError
-from sparsestyle_ns.utils.page import prepare_page
+from sparsestyle_ns.utils.files import prepare_output
 
 
 @dataclass
@@ -49,4 +49,4 @@ class GalleryOptions(CommandOptions):
             raise InputError(f"--frames is {self.frames}; give 0 for no film, or more.")
         for run in self.runs:
             find_config(run, STYLE_METHOD)
-        prepare_page(self.output_path)
+        prepare_output(self.output_path, "The page", "index.html")

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from sparsestyle_ns.evaluation.tables import Table
-from sparsestyle_ns.utils.names import free_name
+from sparsestyle_ns.utils.files import free_name
 from sparsestyle_ns.utils.page import Pixels, render_page
 
 THUMBNAIL_SIDE = 224

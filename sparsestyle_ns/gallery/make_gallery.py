@@ -22,7 +22,8 @@ from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
 from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.page import Pixels, write_page
+from sparsestyle_ns.utils.files import write_output
+from sparsestyle_ns.utils.page import Pixels
 from sparsestyle_ns.utils.progress import say, track
 
 LONGEST_SIDE = 512
@@ -43,7 +44,7 @@ def make_gallery(options: GalleryOptions) -> None:
     for run, film in zip_longest(options.runs, films):
         say(f"Showing {run}")
         runs.append(collect_run(run, film, options.num_views, options.frames, options.evaluate))
-    page = write_page(gallery_page(runs, options.title), options.output_path)
+    page = write_output(options.output_path, gallery_page(runs, options.title), "The page", "index.html")
     first = find_config(options.runs[0]).parent
     finish(page, ["sparsestyle", "export", first, "--format", "html", "--output-path", "scene.html"])
 

@@ -24,14 +24,14 @@ class StylizedView:
     features: Float[Tensor, "rows C"]
     """Of the picture, where the scene covers it; differentiable."""
     content: Float[Tensor, "rows C"]
-    """Those of the content picture, row for row."""
+    """Those of the content picture."""
 
 
 class StylizationLoss(ABC):
     """A loss of views, made once for the painting that they are to become like."""
 
     weight: ClassVar[float] = 0.0
-    """In the sum, unless the run's settings say otherwise; 0 is off, and costs nothing."""
+    """In the sum, unless the run's settings say otherwise; 0 is off."""
 
     def __init__(self, painting: PaintingFeatures) -> None:  # noqa: B027 - a loss may need nothing of the painting
         pass

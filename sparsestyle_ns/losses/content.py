@@ -10,7 +10,7 @@ from sparsestyle_ns.losses.base import StylizationLoss, StylizedView
 
 
 class ContentLoss(StylizationLoss):
-    """L_content of Eq. 5; its weight is λ0, which falls while a scene is stylised (Eq. 6)."""
+    """L_content of Eq. 5; its weight is λ0 (Eq. 6)."""
 
     weight = 10.0
 
@@ -22,20 +22,11 @@ class ContentLoss(StylizationLoss):
 def content_loss(features: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
     """Squared error of features, relative to the size of the target's (L_content of Eq. 5).
 
-    mean((f − f*)²) / mean(f*²): 0 for equal features, 1 for features that have all vanished.
+    mean((f − f*)²) / mean(f*²): 0 for equal features, 1 for features that have all vanished. The target gets no
+    gradient; where it is all zero, the squared error is returned as it is. A `ValueError` for different shapes.
 
-    The paper, like ARF (Sec. 4), takes the squared error alone, whose size depends on the network: two backbones
-    that see the same pictures alike, one with activations ten times as large, would differ by a factor of 100, and
-    the same λ would mean something else for each. The division takes the network's scale out. It is a constant of
-    the target, so it changes neither where the loss is least nor, for one network, any ratio of two losses.
-
-    Args:
-        features: what the rendered view gives, of any shape, `(B, C, H, W)` or `(N, C)` alike.
-        target: what the content picture gives, of the same shape. It gets no gradient. Where it is all zero there
-            is no size to divide by, and the squared error is returned as it is.
-
-    Raises:
-        ValueError: the two shapes differ, which broadcasting would otherwise hide.
+    The paper, like ARF (Sec. 4), takes the squared error alone, whose size depends on the network's activations. By the
+    division, λ means the same for every backbone.
 
     Example:
         >>> content_loss(torch.tensor([3.0, 0.0]), torch.tensor([0.0, 4.0]))

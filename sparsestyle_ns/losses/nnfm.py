@@ -35,15 +35,8 @@ def nearest_neighbors(
 ) -> Int[Tensor, " N"]:
     """For each feature vector the style's most similar one, by cosine.
 
-    The search is exact and compares everything with everything, `chunk_size` rows of either at a time, so that its
-    memory does not grow with the number of pixels; a `StyleIndex`, made once for a style, gives the same answer faster.
-    No gradient passes. Similarities have at least float32's digits, also of half-precision features and under autocast.
-
-    Returns:
-        Rows of `style_features`, 0 … M − 1; of several equally similar ones the first.
-
-    Raises:
-        ValueError: there are no style features.
+    The search compares everything with everything, `chunk_size` rows of either at a time; a `StyleIndex`, made once for
+    a style, gives the same answer faster: the first of several equally similar ones. A `ValueError` without any.
     """
     if isinstance(style_features, StyleIndex):
         return style_features.nearest(features)
@@ -59,34 +52,24 @@ def nnfm_loss(
     features: Float[Tensor, "N C"],
     style_features: Union[Float[Tensor, "M C"], StyleIndex],
     neighbors: Optional[Int[Tensor, " N"]] = None,
-    chunk_size: int = CHUNK_SIZE,
 ) -> Float[Tensor, ""]:
-    """Mean cosine distance between each feature vector and its nearest style feature (L_style of Eq. 5).
+    """Mean cosine distance between each feature vector and its nearest style feature (L_style of Eq. 5), in [0, 2].
 
     (1/N) Σ_i min_j (1 − cos(f_i, s_j)) (ARF, Sec. 4). The choice of j is taken as given when differentiating, as it
     is constant almost everywhere, and the style gets no gradient.
 
-    Args:
-        features: what the rendered view gives, one vector a row, of lengths up to 1e18. One of length zero, or no more
-            than `SHORTEST`, has no direction: it counts as cosine 0 and gets a gradient of zero.
-        style_features: what the style image gives, or an index of it, where it is used more than once or twice.
-        neighbors: what `nearest_neighbors` gave, where it is known; searched otherwise.
-
-    Returns:
-        A scalar in [0, 2]; in [0, 1] for features that are never negative, such as those after a ReLU.
+    Features have lengths up to 1e18. One no longer than `SHORTEST` has no direction: it counts as cosine 0 and gets a
+    gradient of zero. `neighbors` are what `nearest_neighbors` gave, where it is known.
 
     Example:
-        >>> maps = torch.rand(1, 768, 47, 63)
-        >>> vectors = maps.permute(0, 2, 3, 1).flatten(0, 2)
+        >>> vectors = torch.rand(2961, 768)
         >>> nnfm_loss(vectors, style_features=vectors).abs() < 1e-5
         tensor(True)
     """
     if neighbors is None:
-        neighbors = nearest_neighbors(features, style_features, chunk_size)
-    if isinstance(style_features, StyleIndex):
-        matches = style_features.directions_of(neighbors)
-    else:
-        matches = unit_vectors(style_features.detach()[neighbors])
+        neighbors = nearest_neighbors(features, style_features)
+    is_index = isinstance(style_features, StyleIndex)
+    matches = style_features.directions_of(neighbors) if is_index else unit_vectors(style_features.detach()[neighbors])
     features = at_least_float32(features)
     length = torch.linalg.vector_norm(features, dim=-1)
     # The features' directions themselves would be one more large tensor to fill, keep and differentiate.

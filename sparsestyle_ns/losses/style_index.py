@@ -1,7 +1,7 @@
 """The most similar of a style's feature vectors, exactly, with a tenth of the work of comparing with all of them."""
 
 import math
-from typing import List, Optional, Tuple
+from typing import Optional, Tuple
 
 import torch
 from jaxtyping import Float, Int
@@ -14,13 +14,11 @@ SHORTEST = 1e-12
 COARSE, FINE = 23, 127
 """Principal directions in which similarities are bounded, first of all pairs and then of those that are left."""
 BLOCK_SIZES = {"cpu": 128, "cuda": 1024}
-"""Most style vectors in a block of a `StyleIndex`; a GPU wants fewer and larger products."""
+"""Most style vectors in a block; a GPU wants fewer and larger products."""
 BOUNDED_AT_ONCE = {"cpu": 1024, "cuda": 4096}
 """Vectors of either kind whose similarities are bounded at once; on a CPU the bounds should stay in its cache."""
-TABLE_SIZE = 1 << 23
-"""Bounds kept at once, one for each feature vector and block; 32 MiB in float32."""
-BASIS_SAMPLE = 4096
-"""Style vectors from which the principal directions are found."""
+TABLE_SIZE, BASIS_SAMPLE = 1 << 23, 4096
+"""Bounds kept at once, one a feature vector and block, and style vectors that give the principal directions."""
 
 
 class StyleIndex:
@@ -32,17 +30,11 @@ class StyleIndex:
         cos(f, s) ≤ a(f) · a(s) + p(f) p(s) = (a(f), p(f)) · (a(s), p(s)),
 
     a product of k + 1 instead of C numbers. In the style's own principal directions it is tight: with k = 23 of the
-    768 channels of VGG's third block about 3% of a painting's vectors can't be ruled out. They lie together, as the
-    vectors are sorted into blocks of similar ones, so each block is compared with those features, in one matrix
-    product, for which its largest bound reaches the best similarity found so far. That product is the plain search's,
-    and what was ruled out could not have won: the answer is the plain search's as well.
+    768 channels of VGG's third block about 3% of a painting's vectors can't be ruled out. Vectors are sorted into
+    blocks of similar ones; a block is compared, in one product of whole vectors, with those features for which its
+    largest bound reaches the best similarity so far. What is ruled out could not have won, so the answer is exact.
 
-    Args:
-        style_features: one vector a row, M ≥ 1. The index holds a copy of their directions.
-        block_size: most vectors in a block, 1 or more; None: as `BLOCK_SIZES` says. It changes time, not the answer.
-
-    Raises:
-        ValueError: there are no style features.
+    `block_size`, the most vectors in a block, changes time, not the answer. A `ValueError` without style features.
 
     Example:
         >>> style = StyleIndex(torch.rand(1000, 768))
@@ -68,7 +60,7 @@ class StyleIndex:
         self._places = places[first]
 
     def directions_of(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N C"]:
-        """Style vectors in these rows of `style_features`, of length 1 or, where they have no direction, 0."""
+        """Style vectors in these rows, as `unit_vectors`."""
         return self.blocks.flatten(0, 1)[self._places[rows]]
 
     @torch.no_grad()
@@ -80,22 +72,33 @@ class StyleIndex:
 
     def _nearest(self, directions: Float[Tensor, "n C"]) -> Int[Tensor, " n"]:
         coarse, fine = (_outline(directions, basis) for basis in self.bases)
-        matches = _Matches(directions, self.blocks)
+        best = directions.new_full((len(directions),), -torch.inf)
+        compared = []
+
+        def compare(blocks: Int[Tensor, " P"], rows: Int[Tensor, " P"]) -> None:
+            """Compares feature vectors with all style vectors of a block, for pairs sorted by block."""
+            values, places = _block_maxima(directions, self.blocks, blocks, rows)
+            best.scatter_reduce_(0, rows, values, "amax")
+            compared.append((rows, values, self.rows[blocks, places]))
 
         bounds = self._bounds(coarse)
         favorites = bounds.argmax(dim=0)
         by_block = favorites.argsort()
-        matches.compare(favorites[by_block], by_block)
+        compare(favorites[by_block], by_block)
         bounds.scatter_(0, favorites[None], -torch.inf)
-        blocks, rows = (bounds >= matches.best).nonzero(as_tuple=True)
+        blocks, rows = (bounds >= best).nonzero(as_tuple=True)
 
         finer_bounds, _ = _block_maxima(fine, self.fine, blocks, rows)
         best_bounds = finer_bounds.new_full((len(directions),), -torch.inf)
         is_favorite = finer_bounds == best_bounds.scatter_reduce_(0, rows, finer_bounds, "amax")[rows]
-        matches.compare(blocks[is_favorite], rows[is_favorite])
-        is_left = ~is_favorite & (finer_bounds >= matches.best[rows])
-        matches.compare(blocks[is_left], rows[is_left])
-        return matches.first(self.rows)
+        compare(blocks[is_favorite], rows[is_favorite])
+        is_left = ~is_favorite & (finer_bounds >= best[rows])
+        compare(blocks[is_left], rows[is_left])
+
+        rows, values, found = (torch.cat(parts) for parts in zip(*compared, strict=True))
+        is_best = values == best[rows]
+        nearest = rows.new_zeros(len(best))
+        return nearest.scatter_reduce_(0, rows[is_best], found[is_best], "amin", include_self=False)
 
     def _bounds(self, outlines: Float[Tensor, "n k"]) -> Float[Tensor, "blocks n"]:
         """Bounds of the similarities between each feature vector and any style vector of each block."""
@@ -111,30 +114,6 @@ class StyleIndex:
                 torch.mm(blocks.flatten(0, 1), part.T, out=products)
                 torch.amax(products.view(len(blocks), block_size, len(part)), dim=1, out=out)
         return bounds
-
-
-class _Matches:
-    """The best similarity of each feature vector so far, and all pairs that were compared."""
-
-    def __init__(self, directions: Float[Tensor, "n C"], blocks: Float[Tensor, "blocks size C"]) -> None:
-        self.directions = directions
-        self.blocks = blocks
-        self.best = directions.new_full((len(directions),), -torch.inf)
-        self._compared: List[Tuple[Tensor, Tensor, Tensor, Tensor]] = []
-
-    def compare(self, blocks: Int[Tensor, " P"], rows: Int[Tensor, " P"]) -> None:
-        """Compares feature vectors with all style vectors of a block, for pairs sorted by block."""
-        values, places = _block_maxima(self.directions, self.blocks, blocks, rows)
-        self.best.scatter_reduce_(0, rows, values, "amax")
-        self._compared.append((rows, values, blocks, places))
-
-    def first(self, names: Int[Tensor, "blocks size"]) -> Int[Tensor, " n"]:
-        """Of each feature vector's most similar style vectors the smallest name."""
-        rows, values, blocks, places = (torch.cat(parts) for parts in zip(*self._compared, strict=True))
-        is_best = values == self.best[rows]
-        found = names[blocks[is_best], places[is_best]]
-        nearest = rows.new_zeros(len(self.best))
-        return nearest.scatter_reduce_(0, rows[is_best], found, "amin", include_self=False)
 
 
 def check_style(style_features: Float[Tensor, "M C"]) -> None:
@@ -158,8 +137,7 @@ def _first_equal(rows: Float[Tensor, "M C"]) -> Int[Tensor, " M"]:
 
 
 def _principal_axes(directions: Float[Tensor, "M C"]) -> Float[Tensor, "C C"]:
-    """Orthonormal columns, those first in which the vectors are longest."""
-    # Any orthonormal columns bound similarities; a sample gives bounds as good as all.
+    """Orthonormal columns, those first in which the vectors are longest, as a sample of them says."""
     sample = directions[:: -(-len(directions) // BASIS_SAMPLE)].double()
     _, axes = torch.linalg.eigh(sample.T @ sample)
     return axes.flip(1).to(directions.dtype)
@@ -168,10 +146,8 @@ def _principal_axes(directions: Float[Tensor, "M C"]) -> Float[Tensor, "C C"]:
 def _outline(directions: Float[Tensor, "N C"], basis: Float[Tensor, "C k"]) -> Float[Tensor, "N k+1"]:
     """Coefficients of unit vectors in a basis, and the length of the rest; products of two bound the vectors' own.
 
-    The length gets an allowance τ under the root, as √((p² + τ)(q² + τ)) ≥ p q + τ for any p, q ≥ 0. It covers all
-    rounding: with u the unit of it, C u the error of a product of unit vectors and √k C u that of their coefficients,
-    2 √k C u in p², as much in a(f) · a(s), and less than 8 C u in lengths, in the sum and in the similarity that it is
-    compared with.
+    The length gets an allowance τ under the root, as √((p² + τ)(q² + τ)) ≥ p q + τ. It covers all rounding: with u the
+    unit of it, 2 √k C u in p², as much in a(f) · a(s), and less than 8 C u in lengths, sum and similarity.
     """
     channels, count = basis.shape
     unit = torch.finfo(directions.dtype).eps / 2
@@ -184,8 +160,7 @@ def _outline(directions: Float[Tensor, "N C"], basis: Float[Tensor, "C k"]) -> F
 def _similar_blocks(points: Float[Tensor, "M k"], block_size: int) -> Int[Tensor, "blocks size"]:
     """Rows of `points` in blocks of at most this many, similar ones together, each block's in ascending order.
 
-    All points are halved at the median of the coordinate that varies most, then each half, and so on (a k-d tree).
-    Where they can't be shared out evenly, the last occurs more than once.
+    The leaves of a k-d tree; where points can't be shared out evenly, the last occurs more than once.
     """
     depth = (-(-len(points) // block_size) - 1).bit_length()
     leaf_size = -(-len(points) // 2**depth)

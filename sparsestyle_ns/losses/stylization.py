@@ -1,8 +1,4 @@
-"""The losses of stage 2 by name, and what a stylised view is compared with.
-
-A new loss is a file with a `StylizationLoss`, and its line in `LOSSES`. Its weight is a setting of every run from then
-on, and training, the viewer, `sparsestyle evaluate` and the studies show it under its name.
-"""
+"""The losses of stage 2 by name, and what a stylised view is compared with."""
 
 from dataclasses import dataclass
 from typing import Collection, Dict, Optional, Type
@@ -18,7 +14,7 @@ from sparsestyle_ns.losses.nnfm import NNFMLoss
 from sparsestyle_ns.style.backbone import Backbone
 
 LOSSES: Dict[str, Type[StylizationLoss]] = {"content": ContentLoss, "style": NNFMLoss}
-"""All stylisation losses, by name."""
+"""A new one is a file with a `StylizationLoss`, and its entry here."""
 
 
 def default_weights() -> Dict[str, float]:
@@ -47,9 +43,11 @@ def fit_side(image: Float[Tensor, "B C H W"], longer_side: int, smallest_side: i
     """An image resized (bilinear, antialiased) to a longer side of so many pixels, and no side below the smallest."""
     scale = longer_side / max(image.shape[-2:])
     size = tuple(max(smallest_side, round(length * scale)) for length in image.shape[-2:])
-    if size == image.shape[-2:]:
-        return image
-    return F.interpolate(image, size=size, mode="bilinear", antialias=True, align_corners=False)
+    return (
+        image
+        if size == image.shape[-2:]
+        else F.interpolate(image, size=size, mode="bilinear", antialias=True, align_corners=False)
+    )
 
 
 def feature_rows(features: Float[Tensor, "B C h w"]) -> Float[Tensor, "rows C"]:
@@ -77,16 +75,14 @@ def covered_rows(
 
 
 class StyleTargets:
-    """A painting as the feature network sees it, and the losses of pictures against it (the terms of Eq. 5).
+    """A painting in [0, 1] as the feature network sees it, and the losses of pictures against it (the terms of Eq. 5).
 
-    Kept out of the model's modules: a stylised checkpoint holds neither the network nor the painting.
+    Not a module of the model: a stylised checkpoint holds neither the network nor the painting.
 
     Args:
-        style_image: in [0, 1], on the device of the network.
         feature_side: longer side, in pixels, at which the network sees rendered and content pictures.
-        style_side: longer side at which it sees the style image; it sets how large strokes are.
+        style_side: longer side, in pixels, at which it sees the style image; it sets how large strokes are.
         style_features: at most so many of the style image's feature vectors count, drawn at random; None: all.
-        losses: names of those to compute.
     """
 
     def __init__(
@@ -122,11 +118,7 @@ class StyleTargets:
         content: Float[Tensor, "1 C h w"],
         accumulation: Optional[Float[Tensor, "H W"]] = None,
     ) -> StylizedView:
-        """A rendered picture in [0, 1], and the features of the one that it must stay like, ready for the losses.
-
-        Where the scene's opacity, the accumulation, is less than half, the picture shows a background that nothing can
-        stylise, and its features don't count. None: all count.
-        """
+        """A rendered picture in [0, 1], ready for the losses; features count where the accumulation is above half."""
         features, target = (covered_rows(maps, accumulation) for maps in (self.features(image), content))
         return StylizedView(image, features, target)
 

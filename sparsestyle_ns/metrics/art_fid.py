@@ -1,13 +1,10 @@
 """ArtFID: (1 + LPIPS) · (1 + FID), low where content is kept and the style is near (Wright and Ommer 2022, Eq. 1).
 
 LPIPS is between each stylised picture and its content; FID between stylised pictures and paintings, in the features of
-an Inception-v3 that was trained on art. The weights of neither network are part of this package, and nothing downloads
-them: ArtFID is measured where both files are in the torch hub cache, and left out elsewhere.
+an Inception-v3 that was trained on art. It is measured where both weight files are in the torch hub cache.
 
-Its authors compare thousands of pictures with as many paintings. A scene has a few views and one painting, so here the
-sample is squares: all pictures, and the painting, are enlarged or reduced until their shorter side has `SHORTER_SIDE`
-pixels, and cut into overlapping squares of the side that the network was made for. Figures depend on that choice, and
-so do covariances of so few squares: they rank rows that are measured alike, and can't be set beside others' ArtFID.
+Its authors compare thousands of pictures with as many paintings. A scene has a few views and one painting, so here all
+are resized and cut into overlapping squares. Figures rank rows that are measured alike, not beside others'.
 """
 
 import functools
@@ -27,21 +24,16 @@ from sparsestyle_ns.utils.weight_files import check_tensor, hub_file, read_state
 ART_INCEPTION_FILE = "art_inception.pth"
 HEADS = ("fc1.", "fc2.", "AuxLogits1.", "AuxLogits2.")
 """Classifiers in that file, which the features don't need."""
-SQUARE = 299
-"""Side of the squares, in pixels: that of the pictures that Inception-v3 was made for."""
-SHORTER_SIDE = 448
-"""Shorter side, in pixels, of the pictures that they are cut from: one and a half squares."""
-STEP = 75
-"""Pixels from one square to the next, at most."""
+SQUARE, SHORTER_SIDE, STEP = 299, 448, 75
+"""Pixels: side of the squares, shorter side of what they are cut from, and way from one to the next, at most."""
 
 
 def frechet_distance(first: Float[Tensor, "n C"], second: Float[Tensor, "m C"]) -> float:
     """FID of two samples of features: |μ − μ'|² + tr Σ + tr Σ' − 2 tr (Σ Σ')^½ (Heusel et al. 2017, Eq. 6).
 
-    With X and X' the centred samples over √(n − 1) and √(m − 1), Σ = XᵀX and Σ' = X'ᵀX', the eigenvalues of Σ Σ' other
-    than 0 are those of (X X'ᵀ)(X X'ᵀ)ᵀ. So the last trace is the sum of the singular values of X X'ᵀ, a matrix of n × m
-    numbers, however singular the covariances are. A sample of one has the covariance 0. The result, in
-    units of the features squared, is 0 where mean and covariance are equal, else more.
+    With X and X' the centred samples over √(n − 1) and √(m − 1), Σ = XᵀX and Σ' = X'ᵀX', so that the last trace is the
+    sum of the singular values of X X'ᵀ, however singular the covariances are. A sample of one has the covariance 0. The
+    result, in units of the features squared, is 0 where mean and covariance are equal.
     """
     samples = [sample.double() for sample in (first, second)]
     means = [sample.mean(dim=0) for sample in samples]
@@ -70,18 +62,10 @@ def squares(picture: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "squares 3 side 
 
 @functools.lru_cache(maxsize=1)
 def load_art_inception(path: Path) -> nn.Module:
-    """The Inception-v3 of a file as ArtFID's authors publish it; pictures in [0, 1] in, 2048 features a picture out.
-
-    The file is a state dict of torchvision's Inception-v3 with two heads and two auxiliary ones (`HEADS`) in place of
-    torchvision's. As in the authors' code, colours go in as they are, and the features are the pooled ones before the
-    heads.
-
-    Raises:
-        InputError: the file can't be read, or is of another network.
-    """
+    """ArtFID's Inception-v3, from pictures in [0, 1] to 2048 features; an `InputError` for another network's file."""
     from torchvision.models import inception_v3
 
-    with torch.device("meta"):  # the weights come from the file, and torch's random state stays untouched
+    with torch.device("meta"):  # torch's random state stays untouched
         network = inception_v3(weights=None, aux_logits=False, init_weights=False, transform_input=False)
     network.fc = nn.Identity()
     expected = network.state_dict()
@@ -115,7 +99,7 @@ def why_left_out(figures: Dict[str, float]) -> str:
 
 
 class ArtFID:
-    """ArtFID of pictures that are added one by one, by the network of `load_art_inception`; the painting in [0, 1]."""
+    """ArtFID of pictures that are added one by one; they and the painting in [0, 1]."""
 
     def __init__(self, network: nn.Module, painting: Float[Tensor, "3 H W"]) -> None:
         self.network = network
@@ -125,7 +109,7 @@ class ArtFID:
 
     @classmethod
     def against(cls, painting: Float[Tensor, "3 H W"]) -> Optional["ArtFID"]:
-        """With the weights in the torch hub cache; None where some are missing. Raises as `load_art_inception` does."""
+        """With the weights in the torch hub cache; None where some are missing."""
         return None if missing_weights() else cls(load_art_inception(hub_file(ART_INCEPTION_FILE)), painting)
 
     @torch.no_grad()

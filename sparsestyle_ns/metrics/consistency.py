@@ -13,27 +13,20 @@ from sparsestyle_ns.utils.progress import track
 
 RANGES = {"short": 1, "long": 7}
 """Frames between the two views of a pair, as in Stylos and Styl3R."""
-SSIM_SIGMA = 1.5
-SSIM_RADIUS = 5
-"""The Gaussian window of SSIM (Wang et al. 2004): 11 × 11."""
-SSIM_CONSTANTS = (0.01**2, 0.03**2)
+SSIM_SIGMA, SSIM_RADIUS, SSIM_CONSTANTS = 1.5, 5, (0.01**2, 0.03**2)
+"""The Gaussian window of SSIM, 11 × 11, and what keeps its quotients finite (Wang et al. 2004)."""
+
+Picture = Float[Tensor, "H W 3"]
+Mask = Bool[Tensor, "H W"]
 
 
-def masked_rmse(
-    first: Float[Tensor, "H W 3"], second: Float[Tensor, "H W 3"], visible: Bool[Tensor, "H W"]
-) -> Float[Tensor, ""]:
+def masked_rmse(first: Picture, second: Picture, visible: Mask) -> Float[Tensor, ""]:
     """Root of the mean squared difference over visible pixels and channels; NaN where none is visible."""
     return (first - second)[visible].square().mean().sqrt()
 
 
-def masked_ssim(
-    first: Float[Tensor, "H W C"], second: Float[Tensor, "H W C"], visible: Bool[Tensor, "H W"]
-) -> Float[Tensor, ""]:
-    """Mean structural similarity over visible pixels, of pictures in [0, 1]; NaN where none is visible.
-
-    SSIM (Wang et al. 2004) with each window's weights shared out among its visible pixels, so that neither what is
-    occluded nor what lies beyond the border has a say.
-    """
+def masked_ssim(first: Picture, second: Picture, visible: Mask) -> Float[Tensor, ""]:
+    """Mean SSIM (Wang et al. 2004) of pictures in [0, 1], by visible pixels alone; NaN where none is visible."""
     offsets = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, device=first.device, dtype=first.dtype)
     profile = torch.exp(-0.5 * (offsets / SSIM_SIGMA).square())
     window = torch.outer(profile, profile)[None, None] / profile.sum().square()
@@ -53,27 +46,17 @@ def masked_ssim(
     return likeness[:, 0].mean(dim=0)[visible].mean()
 
 
-def masked_distance(
-    metric: Metric, first: Float[Tensor, "H W 3"], second: Float[Tensor, "H W 3"], visible: Bool[Tensor, "H W"]
-) -> float:
-    """A perceptual distance of visible pixels, by a metric that is a mean over pixels, 0 where pictures are equal.
-
-    What isn't visible is black in both pictures, where they are alike, and the distance, a mean over the whole picture,
-    is divided by the visible share.
-    """
+def masked_distance(metric: Metric, first: Picture, second: Picture, visible: Mask) -> float:
+    """A perceptual distance of visible pixels, by a metric that is a mean over pixels, 0 where pictures are equal."""
+    # What isn't visible is black in both pictures, and the mean is divided by the visible share.
     mask = visible[..., None]
     pictures = (torch.where(mask, picture, 0.0).permute(2, 0, 1)[None].cpu() for picture in (first, second))
     return float(metric(*pictures)) / float(visible.float().mean())
 
 
 @torch.no_grad()
-def pair_consistency(
-    first: Float[Tensor, "H W 3"], second: Float[Tensor, "H W 3"], correspondence: Correspondence
-) -> Dict[str, float]:
-    """`rmse`, `ssim`, and where there are weights `lpips` and `st_lpips`, between a view and another one warped to it.
-
-    Over visible pixels, of pictures in [0, 1]. Nothing where no pixel is visible.
-    """
+def pair_consistency(first: Picture, second: Picture, correspondence: Correspondence) -> Dict[str, float]:
+    """`rmse`, `ssim` and `perceptual_metrics` of a view and another warped to it; nothing where they share no pixel."""
     visible = correspondence.visible
     if not visible.any():
         return {}
@@ -87,10 +70,7 @@ def pair_consistency(
 
 
 class PathGeometry:
-    """Which pixels of a path's frames show the same points; worked out once for all pictures that are measured by it.
-
-    `surfaces` are what each frame shows of the unstylised scene.
-    """
+    """Which pixels of a path's frames show the same points, by what each frame shows of the unstylised scene."""
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
         self.pairs = {}

@@ -1,7 +1,6 @@
-"""How like a photo a picture is: PSNR, SSIM, LPIPS where its weights are on the machine, and ST-LPIPS.
+"""How like a photo a picture is: PSNR, SSIM, LPIPS and ST-LPIPS; and how like a painting, by Gram matrices.
 
-ST-LPIPS (Ghildyal and Liu 2022) is LPIPS with a network that isn't moved by tiny shifts. Its AlexNet and the linear
-heads come with the package stlpips-pytorch, of which only the weight file is read. Its numbers are not LPIPS's.
+ST-LPIPS (Ghildyal and Liu 2022) is LPIPS with a network that isn't moved by tiny shifts; its numbers are not LPIPS's.
 """
 
 import functools
@@ -18,18 +17,10 @@ from sparsestyle_ns.utils.weight_files import hub_file, read_state, shift_tolera
 Metric = Callable[[Float[Tensor, "B 3 H W"], Float[Tensor, "B 3 H W"]], Float[Tensor, ""]]
 """Distance of pictures in [0, 1]."""
 ALEXNET_FILE = "alexnet-owt-7be5be79.pth"
-SHIFT_TOLERANT_LAYERS = (
-    ("net.slice1.0", "net.slice1.1"),
-    ("net.slice2.5", "net.slice2.4"),
-    ("net.slice3.9", "net.slice3.8"),
-    ("net.slice4.11", None),
-    ("net.slice5.13", None),
-)
-"""Each layer's convolution and blur in the weight file."""
-MIN_LPIPS_SIDE = 31
-"""Pixels a side below which nothing is left of a picture for LPIPS' last layers."""
-MIN_SHIFT_TOLERANT_SIDE = 24
-"""Pixels a side below which nothing is left of a picture for ST-LPIPS' last layers."""
+SHIFT_TOLERANT_LAYERS = (("1.0", "1.1"), ("2.5", "2.4"), ("3.9", "3.8"), ("4.11", None), ("5.13", None))
+"""Each layer's convolution and blur in the weight file, after "net.slice"."""
+MIN_LPIPS_SIDE, MIN_SHIFT_TOLERANT_SIDE = 31, 24
+"""Pixels a side below which nothing is left of a picture for the last layers."""
 
 
 def psnr(image: Float[Tensor, "H W 3"], reference: Float[Tensor, "H W 3"]) -> float:
@@ -56,19 +47,15 @@ def _load_lpips(weights: Path) -> Metric:
 
 
 def lpips_metric(size: Tuple[int, ...]) -> Optional[Metric]:
-    """LPIPS with AlexNet for pictures of a height and width, on the CPU.
-
-    None where these are too small, or the network's weights are not in the torch hub cache. torchmetrics would download
-    them; measuring a picture must not depend on a network.
-    """
+    """LPIPS with AlexNet for pictures of a height and width, on the CPU; None for tiny ones or without its weights."""
+    # torchmetrics would download the weights; measuring a picture must not depend on a network.
     return _load_lpips(hub_file(ALEXNET_FILE)) if has_lpips() and min(size) >= MIN_LPIPS_SIDE else None
 
 
 class ShiftTolerantLPIPS:
-    """ST-LPIPS with AlexNet: the distance of two pictures in the features of five layers.
+    """ST-LPIPS with AlexNet: squared differences of unit feature vectors of five layers, weighted by channel.
 
-    Each layer's feature vectors are scaled to length 1; their squared differences, weighted by channel, are averaged
-    over the picture and summed over the layers (Zhang et al. 2018, Eq. 1). `state` is the weight file's content.
+    Averaged over the picture and summed over the layers (Zhang et al. 2018, Eq. 1). `state` is the weight file's.
     """
 
     def __init__(self, state: Dict[str, Tensor]) -> None:
@@ -79,7 +66,7 @@ class ShiftTolerantLPIPS:
         state, maps = self.state, []
         hidden = (2.0 * pictures - 1.0 - state["scaling_layer.shift"]) / state["scaling_layer.scale"]
         for index, (convolution, blur) in enumerate(SHIFT_TOLERANT_LAYERS):
-            weight, bias = state[f"{convolution}.weight"], state[f"{convolution}.bias"]
+            weight, bias = state[f"net.slice{convolution}.weight"], state[f"net.slice{convolution}.bias"]
             if index == 0:
                 hidden = F.relu(self._blur(F.conv2d(hidden, weight, bias, padding=2), blur))
             else:
@@ -91,7 +78,7 @@ class ShiftTolerantLPIPS:
 
     def _blur(self, maps: Tensor, name: str) -> Tensor:
         padded = F.pad(maps, (2, 2, 2, 2), mode="reflect")
-        return F.conv2d(padded, self.state[f"{name}.filt"], stride=2, groups=maps.shape[1])
+        return F.conv2d(padded, self.state[f"net.slice{name}.filt"], stride=2, groups=maps.shape[1])
 
     @torch.no_grad()
     def __call__(self, first: Float[Tensor, "B 3 H W"], second: Float[Tensor, "B 3 H W"]) -> Float[Tensor, ""]:
@@ -109,7 +96,7 @@ def _load_st_lpips() -> Optional[Metric]:
 
 
 def st_lpips_metric(size: Tuple[int, ...]) -> Optional[Metric]:
-    """ST-LPIPS for pictures of a height and width, on the CPU; None where its weights are gone or these too small."""
+    """ST-LPIPS for pictures of a height and width, on the CPU; None where these are too small or its weights gone."""
     return _load_st_lpips() if min(size) >= MIN_SHIFT_TOLERANT_SIDE else None
 
 
@@ -130,3 +117,13 @@ def image_metrics(image: Float[Tensor, "H W 3"], photo: Float[Tensor, "H W 3"]) 
         "ssim": float(structural_similarity_index_measure(batch, reference, data_range=1.0)),
         **{name: float(metric(batch, reference)) for name, metric in perceptual_metrics(photo.shape[:2]).items()},
     }
+
+
+def gram_matrix(features: Float[Tensor, "N C"]) -> Float[Tensor, "C C"]:
+    """(1/N) Σ f fᵀ: how much of each pair of channels occurs together (Gatys et al. 2016, Eq. 3, over the pixels)."""
+    return features.T @ features / len(features)
+
+
+def gram_distance(gram: Float[Tensor, "C C"], style_gram: Float[Tensor, "C C"]) -> Float[Tensor, ""]:
+    """|G − G_style|² / |G_style|²: Gatys et al. (2016), Eq. 4, but relative to the style, for any network."""
+    return torch.linalg.matrix_norm(gram - style_gram).square() / torch.linalg.matrix_norm(style_gram).square()

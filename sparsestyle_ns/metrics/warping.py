@@ -1,8 +1,6 @@
 """Carrying a picture from one camera to another by the geometry that both see, and which pixels may be carried.
 
-A pixel of the first view is a point of the scene; where the second camera sees that point is where the picture is read.
 The geometry is the *unstylised* scene's, so that a stylised picture can't hide its flicker in geometry of its own.
-
 Pixel coordinates are (column, row) with the centre of the first pixel at (0.5, 0.5), as in nerfstudio.
 """
 
@@ -38,7 +36,7 @@ class Pinhole:
 
 @dataclass
 class Surface:
-    """What a camera sees of the unstylised scene: the world points that its pixels show, and which show any."""
+    """The world points of the unstylised scene that a camera's pixels show, and which show any."""
 
     camera: Pinhole
     points: Float[Tensor, "H W 3"]
@@ -80,8 +78,7 @@ def is_occluded(forward: Float[Tensor, "*batch 2"], backward: Float[Tensor, "*ba
 def correspond(first: Surface, second: Surface) -> Correspondence:
     """Where the second view shows what the first one's pixels show.
 
-    A pixel is visible where its point lies before the second camera and inside its picture, both views show a surface
-    there, and the way there and back by either view's own points agrees (`is_occluded`).
+    Both must show a surface there, and the way there and back agree (`is_occluded`).
     """
     height, width = second.covered.shape
     pixels, in_front = second.camera.project(first.points)
@@ -89,9 +86,7 @@ def correspond(first: Surface, second: Surface) -> Correspondence:
     forward = pixels - pixel_centers(*first.covered.shape, pixels)
     returning, back_in_front = first.camera.project(second.points)
     # Infinity is no number to interpolate with: what can't be seen from the first camera leads nowhere near.
-    backward_flow = torch.where(
-        back_in_front[..., None], returning - pixel_centers(height, width, pixels), torch.tensor(1e6).to(pixels)
-    )
+    backward_flow = torch.where(back_in_front[..., None], returning - pixel_centers(height, width, pixels), 1e6)
     usable = sample_picture(second.covered.to(pixels)[..., None], pixels)[..., 0] > 0.999
     occluded = is_occluded(forward, sample_picture(backward_flow, pixels))
     return Correspondence(pixels, first.covered & in_front & inside & usable & ~occluded)

@@ -20,8 +20,7 @@ from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.field_components.positional_encoding import revealed_levels
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
-from sparsestyle_ns.losses.geometry import matched_depth_loss, near_density
-from sparsestyle_ns.losses.reconstruction import reconstruction_loss
+from sparsestyle_ns.losses.coarse import matched_depth_loss, near_density, reconstruction_loss
 from sparsestyle_ns.metrics.image import image_metrics, psnr_of_error
 from sparsestyle_ns.models.scene_model import SceneModel
 from sparsestyle_ns.rendering.render import DenseRender, render_coarse, seen_behind, surface_distance

@@ -21,7 +21,7 @@ from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, FewShotData
 from sparsestyle_ns.style.backbone import Backbone
 from sparsestyle_ns.style.backbones import BackboneChoice, load_backbone
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
-from sparsestyle_ns.utils.ffmpeg import put_ffmpeg_on_path
+from sparsestyle_ns.utils.machine import put_ffmpeg_on_path
 
 TestMode = Literal["test", "val", "inference"]
 

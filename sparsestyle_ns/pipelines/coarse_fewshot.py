@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sparsestyle_ns.core.camera_paths import unseen_places
 from sparsestyle_ns.effects.registry import decide_again
-from sparsestyle_ns.losses.semantic import pooled_features, semantic_loss
+from sparsestyle_ns.losses.coarse import pooled_features, semantic_loss
 from sparsestyle_ns.losses.stylization import fit_side
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel, CoarseFewShotModelConfig
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig

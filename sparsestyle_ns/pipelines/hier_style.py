@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from sparsestyle_ns.core.schedules import content_weight
 from sparsestyle_ns.effects.base import Decisions
-from sparsestyle_ns.losses.reconstruction import reconstruction_loss
+from sparsestyle_ns.losses.coarse import reconstruction_loss
 from sparsestyle_ns.losses.stylization import LOSSES, Losses, StyleTargets, default_weights
 from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig

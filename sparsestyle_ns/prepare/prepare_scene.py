@@ -18,7 +18,7 @@ from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, find_photos, fra
 from sparsestyle_ns.prepare.poses import TRANSFORMS, find_poses, read_for_pose, say_what_is_turned
 from sparsestyle_ns.prepare.prepare_options import PrepareOptions
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.ffmpeg import put_ffmpeg_on_path
+from sparsestyle_ns.utils.machine import put_ffmpeg_on_path
 
 PoseSource = Literal["auto", "file", "colmap"]
 

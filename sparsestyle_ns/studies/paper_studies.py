@@ -14,7 +14,7 @@ from sparsestyle_ns.studies.study_options import StudyOptions
 from sparsestyle_ns.studies.study_page import study_page
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.page import prepare_page, write_page
+from sparsestyle_ns.utils.files import prepare_output, write_output
 
 
 def compare(options: StudyOptions) -> None:
@@ -53,7 +53,7 @@ def check_options(options: StudyOptions) -> PaperRuns:
         raise InputError(f"--jobs is {options.jobs}; at least one run at a time is needed.")
     for painting in options.style_images:
         Painting.read(painting)
-    prepare_page(options.output_path)
+    prepare_output(options.output_path, "The page", "index.html")
     study = Study(
         options.data,
         dataparser,
@@ -77,4 +77,5 @@ def _run_study(
     for section in sections:
         for table in section.tables:
             table.print()
-    return write_page(study_page(f"{title}: {runs.study.name}", sections), options.output_path)
+    page = study_page(f"{title}: {runs.study.name}", sections)
+    return write_output(options.output_path, page, "The page", "index.html")

@@ -17,8 +17,7 @@ from sparsestyle_ns.engine.loading import evaluate_run, load_run
 from sparsestyle_ns.evaluation.held_out import PathFrames, render_path, saved_report, stylisation_figures
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID, missing_weights
-from sparsestyle_ns.metrics.gram import gram_matrix
-from sparsestyle_ns.metrics.image import has_lpips, image_metrics
+from sparsestyle_ns.metrics.image import gram_matrix, has_lpips, image_metrics
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import REPORT_FILE

@@ -23,8 +23,7 @@ from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.studies.study import Stage, Study
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
-from sparsestyle_ns.utils.progress import bar, duration, say
-from sparsestyle_ns.utils.progress_file import PROGRESS_FILE, ProgressReport
+from sparsestyle_ns.utils.progress import PROGRESS_FILE, ProgressReport, bar, duration, say
 
 SECONDS_FILE = "training_seconds.json"
 TRAINING_PROCESS = (sys.executable, "-m", "sparsestyle_ns.studies.training_process")

@@ -11,7 +11,7 @@ import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts import train
 
-from sparsestyle_ns.utils.progress_file import ProgressReport, report
+from sparsestyle_ns.utils.progress import ProgressReport, report
 
 
 def train_run(config: TrainerConfig) -> None:

@@ -1,4 +1,4 @@
-"""What a feature network is to the rest of the package, and the weight file it is made from."""
+"""What a feature network is, and the weight file it is made from."""
 
 import hashlib
 from abc import ABC, abstractmethod
@@ -15,7 +15,7 @@ from sparsestyle_ns.utils.weight_files import read_state
 
 @dataclass(frozen=True)
 class BackboneDescription:
-    """Which feature network is in use, by its name on the command line, and where its weights came from, in words."""
+    """Which feature network is in use, and where its weights came from, in words."""
 
     name: str
     source: str
@@ -41,20 +41,14 @@ class Weights:
 
     def describe(self, name: str) -> BackboneDescription:
         """The description of the network `name` with these weights."""
-        with self.path.open("rb") as file:
-            digest = hashlib.sha256()
-            while chunk := file.read(1 << 20):
-                digest.update(chunk)
-        return BackboneDescription(name, self.source, digest.hexdigest())
+        return BackboneDescription(name, self.source, hashlib.sha256(self.path.read_bytes()).hexdigest())
 
 
 class Backbone(nn.Module, ABC):
-    """A frozen network that turns pictures into feature maps."""
+    """A frozen network, `--backbone NAME`, that turns pictures into feature maps."""
 
     name: ClassVar[str]
-    """On the command line, `--backbone NAME`."""
     channels: ClassVar[int]
-    """Of the feature maps."""
     smallest_side: ClassVar[int]
     """Pixels that each side of a picture must have."""
     description: BackboneDescription
@@ -82,11 +76,7 @@ class Backbone(nn.Module, ABC):
     @classmethod
     @abstractmethod
     def load(cls, weights: Weights, state: Dict[str, Any]) -> "Backbone":
-        """The network with these weights, on the CPU, in evaluation mode and without gradients of its own.
-
-        Raises:
-            InputError: the state isn't one of this network.
-        """
+        """The network, on the CPU, frozen and in evaluation mode; an `InputError` where the state isn't one of it."""
 
     @abstractmethod
     def forward(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B C h w"]:

@@ -1,7 +1,4 @@
-"""All feature networks, and the one that a run gets.
-
-A new one is a class (`style.backbone.Backbone`) and its line in `BACKBONES`.
-"""
+"""All feature networks, and the one that a run gets. A new one is a `Backbone` and its line in `BACKBONES`."""
 
 from pathlib import Path
 from typing import Dict, Literal, Optional, Type
@@ -19,13 +16,8 @@ BackboneChoice = Literal[("auto", *BACKBONES)]
 def load_backbone(name: str = "auto", weights: Optional[Path] = None) -> Backbone:
     """The feature network, on the CPU, with weights from a file or from wherever this machine has them.
 
-    Args:
-        name: a key of `BACKBONES`, or `auto`: the network that `weights` is of, else the first that has weights here.
-        weights: a weight file; for the networks known so far a state dict of torchvision's VGG-16 or of ST-LPIPS' VGG,
-            in which layers after relu3_3 may be missing.
-
-    Raises:
-        InputError: there are no weights to be had, or the file is not of the network asked for.
+    `auto` is the network that the file is of, else the first that has weights here. An `InputError` where there are no
+    weights to be had, or the file is not of the network asked for.
     """
     if weights is not None:
         return _load_file(name, Path(weights).expanduser())
@@ -41,7 +33,7 @@ def load_backbone(name: str = "auto", weights: Optional[Path] = None) -> Backbon
 
 
 def available_backbone() -> Optional[str]:
-    """The name of the network that `load_backbone()` gives; None where no weights are found or can be downloaded."""
+    """The name of the network that `load_backbone()` gives; None where it would find no weights."""
     return next((kind.name for kind in BACKBONES.values() if kind.find_weights() is not None), None)
 
 

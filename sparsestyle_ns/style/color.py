@@ -1,6 +1,6 @@
 """Palette transfer: the affine map of colours that gives a scene the mean and covariance of a painting's colours.
 
-Letters, as in ARF: μ is a mean colour and Σ a covariance of colours; the subscript c stands for content, s for style.
+As in ARF, μ is a mean colour and Σ a covariance; the subscript c stands for content, s for style.
 """
 
 from typing import Optional
@@ -11,20 +11,19 @@ from torch import Tensor
 
 from sparsestyle_ns.utils.errors import InputError
 
+Mean = Float[Tensor, "3"]
+Covariance = Float[Tensor, "3 3"]
+
 SMALLEST_SPREAD = 1 / 255
 """Standard deviation, in units of the colour range, below which a direction counts as a rounding error."""
 
 
 def color_moments(
     colors: Float[Tensor, "*batch 3"], weights: Optional[Float[Tensor, "*batch"]] = None
-) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
-    """Mean and covariance of colours.
+) -> tuple[Mean, Covariance]:
+    """Mean μ = Σ_i w_i c_i / Σ_i w_i and covariance Σ_i w_i (c_i − μ)(c_i − μ)ᵀ / Σ_i w_i, w ≥ 0, in float64.
 
-    μ = Σ_i w_i c_i / Σ_i w_i and Σ = Σ_i w_i (c_i − μ)(c_i − μ)ᵀ / Σ_i w_i, computed and returned in float64. Weights
-    are 0 or more; without them all colours count alike.
-
-    Raises:
-        InputError: there are no colours, or no weight is positive.
+    An `InputError` where no weight is positive.
     """
     points = colors.reshape(-1, 3).double()
     weight = torch.ones_like(points[:, :1]) if weights is None else weights.reshape(-1, 1).double()
@@ -37,10 +36,7 @@ def color_moments(
 
 
 def gaussian_distance(
-    first_mean: Float[Tensor, "3"],
-    first_covariance: Float[Tensor, "3 3"],
-    second_mean: Float[Tensor, "3"],
-    second_covariance: Float[Tensor, "3 3"],
+    first_mean: Mean, first_covariance: Covariance, second_mean: Mean, second_covariance: Covariance
 ) -> Float[Tensor, ""]:
     """2-Wasserstein distance between two Gaussians, in float64 (Dowson and Landau 1982).
 
@@ -53,25 +49,21 @@ def gaussian_distance(
     return ((first_mean.double() - second_mean.double()).square().sum() + spread).sqrt()
 
 
-def _square_root(covariance: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+def _square_root(covariance: Covariance) -> Float[Tensor, "3 3"]:
     variances, axes = torch.linalg.eigh(covariance)
     return (axes * variances.clamp_min(0).sqrt()) @ axes.T
 
 
 def palette_transform(
-    content_mean: Float[Tensor, "3"],
-    content_covariance: Float[Tensor, "3 3"],
-    style_mean: Float[Tensor, "3"],
-    style_covariance: Float[Tensor, "3 3"],
+    content_mean: Mean, content_covariance: Covariance, style_mean: Mean, style_covariance: Covariance
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """The map c ↦ A c + b that gives the content's colours the style's mean and covariance.
 
     A = Σ_s^½ Σ_c^−½ with symmetric square roots and b = μ_s − A μ_c (ARF, Sec. 4).
 
-    A photograph without colour, or of one colour, has a singular Σ_c, whose inverse would turn rounding errors into
-    paint. Along an eigenvector of Σ_c with a standard deviation σ of at least `SMALLEST_SPREAD` the gain is the exact
-    1/σ; below, it falls in proportion to σ, from 1/`SMALLEST_SPREAD` to 0. The map is continuous in its arguments,
-    its gain is bounded, and directions in which the content has no variance are mapped to the style's mean.
+    The inverse of a singular Σ_c, as of a grey photo, would turn rounding errors into paint. So along an eigenvector of
+    Σ_c with a standard deviation σ below `SMALLEST_SPREAD` the gain isn't 1/σ but falls in proportion to σ, from
+    1/`SMALLEST_SPREAD` to 0: the map is continuous, its gain bounded, and what doesn't vary gets the style's mean.
 
     Colours are in [0, 1], A and b in float64.
     """
@@ -86,10 +78,6 @@ def palette_transform(
 def apply_palette(
     colors: Float[Tensor, "*batch 3"], matrix: Float[Tensor, "3 3"], offset: Float[Tensor, "3"], clamp: bool = False
 ) -> Float[Tensor, "*batch 3"]:
-    """A c + b for every colour, in the colours' own dtype and on their device.
-
-    With A and b of `palette_transform` the result has the style's exact mean and covariance, but may leave the range of
-    colours that a screen can show; `clamp` cuts it to [0, 1].
-    """
+    """A c + b for every colour, in the colours' own dtype and on their device; `clamp` cuts it to [0, 1]."""
     transferred = colors @ matrix.to(colors).T + offset.to(colors)
     return transferred.clamp(0, 1) if clamp else transferred

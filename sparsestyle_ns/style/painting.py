@@ -14,19 +14,15 @@ from torch import Tensor
 
 from sparsestyle_ns.utils.errors import InputError
 
-SMALLEST_SIDE = 8
-"""Pixels a side that the feature network needs: it halves an image twice before block 3."""
-THUMBNAIL_SIDE = 200
-"""Longer side of a painting's thumbnail, in pixels."""
+SMALLEST_SIDE, THUMBNAIL_SIDE = 8, 200
+"""Pixels: what each side of a painting must have, and the longer side of its thumbnail."""
 
 
 @dataclass(frozen=True)
 class Painting:
-    """A painting, decoded once.
+    """A painting, decoded once: all that Pillow reads, PNG of 16 bits without loss, transparent pixels laid over white.
 
-    Everything Pillow reads is taken: JPEG (CMYK too), PNG (grey, palette, transparent, 16 bits without loss), WebP,
-    TIFF and others; of an animation the first frame. Transparent pixels are laid over white. Colour profiles are not
-    applied. `name` is its file's, without folders, and `data` what is in it.
+    Colour profiles are not applied. `name` is its file's, without folders, and `data` what is in it.
     """
 
     name: str
@@ -36,11 +32,7 @@ class Painting:
 
     @classmethod
     def read(cls, path: Union[str, Path]) -> "Painting":
-        """Reads a file.
-
-        Raises:
-            InputError: there is no such file, it can't be read as an image, or it has fewer than 8 pixels a side.
-        """
+        """Reads a file; an `InputError` where it isn't an image of 8 pixels a side or more."""
         path = Path(path).expanduser()
         data = _read_bytes(path)
         return cls(path.name, data, _decode(data, path))
@@ -82,8 +74,8 @@ def _decode(data: bytes, name: Union[str, Path]) -> Float[Tensor, "3 H W"]:
             image.load()
             # Of 16 bits a channel in a PNG, whose header has the depth at byte 24, Pillow would keep 8.
             is_deep = data.startswith(b"\x89PNG\r\n\x1a\n") and data[24] == 16
-            pixels = _decode_deep_png(data) if is_deep else _decode_with_pillow(image)
-            pixels = _turn_upright(_lay_over_white(pixels), image.getexif().get(ExifTags.Base.Orientation, 1))
+            pixels = _to_rgb(_decode_deep_png(data) if is_deep else _decode_with_pillow(image))
+            pixels = _turn_upright(pixels, image.getexif().get(ExifTags.Base.Orientation, 1))
     except UnidentifiedImageError as error:
         raise InputError(
             f"The style image {name} is in no known image format: give a JPEG, PNG or WebP file."
@@ -101,33 +93,31 @@ def _decode(data: bytes, name: Union[str, Path]) -> Float[Tensor, "3 H W"]:
     return torch.from_numpy(pixels).permute(2, 0, 1).contiguous().clamp(0, 1)
 
 
-def _decode_deep_png(data: bytes) -> Float[np.ndarray, "H W channels"]:
+def _decode_deep_png(data: bytes) -> Shaped[np.ndarray, "H W channels"]:
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ValueError("its 16-bit PNG data cannot be decoded")
     to_rgb = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
-    return _to_unit_range(cv2.cvtColor(pixels, to_rgb[1 if pixels.ndim == 2 else pixels.shape[2]]))
+    return cv2.cvtColor(pixels, to_rgb[1 if pixels.ndim == 2 else pixels.shape[2]])
 
 
-def _decode_with_pillow(image: Image.Image) -> Float[np.ndarray, "H W channels"]:
+def _decode_with_pillow(image: Image.Image) -> Shaped[np.ndarray, "H W channels"]:
     if image.mode.startswith("I;16"):
-        return _to_unit_range(np.repeat(np.asarray(image).astype(np.uint16)[..., None], 3, axis=2))
+        return np.repeat(np.asarray(image).astype(np.uint16)[..., None], 3, axis=2)
     if image.mode in ("I", "F"):
         raise ValueError(f"pixels of the kind {image.mode} have no fixed range")
-    return _to_unit_range(np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB")))
+    return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
 
 
-def _to_unit_range(pixels: Shaped[np.ndarray, "H W channels"]) -> Float[np.ndarray, "H W channels"]:
-    return pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
-
-
-def _lay_over_white(pixels: Float[np.ndarray, "H W channels"]) -> Float[np.ndarray, "H W 3"]:
+def _to_rgb(pixels: Shaped[np.ndarray, "H W channels"]) -> Float[np.ndarray, "H W 3"]:
+    """Integers as colours in [0, 1], laid over white where they have an opacity."""
+    pixels = pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
     color, alpha = pixels[..., :3], pixels[..., 3:]
     return color * alpha + (1 - alpha) if alpha.size else color
 
 
 def _turn_upright(pixels: Float[np.ndarray, "H W 3"], orientation: int) -> Float[np.ndarray, "H W 3"]:
-    """Undoes the camera's orientation: EXIF 5 to 8 swap rows and columns, then each of 2 to 8 flips what it says."""
+    """Undoes the camera's orientation: EXIF 5 to 8 swap rows and columns, then some flip either."""
     if orientation in (5, 6, 7, 8):
         pixels = pixels.transpose(1, 0, 2)
     if orientation in (3, 4, 7, 8):

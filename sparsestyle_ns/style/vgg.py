@@ -1,10 +1,7 @@
-"""VGG-16 features of block 3, and where their weights come from on a machine without a network.
+"""VGG-16 features of block 3, by either of two networks with the same convolutions.
 
-Two networks with the same convolutions are known:
-
-- `vgg16`: VGG-16 as torchvision has it, with 2×2 max pooling of stride 2;
-- `vgg16-shift-tolerant`: the trunk of ST-LPIPS, in which max pooling has stride 1 and a 3×3 binomial blur of stride 2
-  follows, after reflecting two pixels over each border. Its maps have one row and one column more: H ↦ ⌊H/2⌋ + 1.
+`vgg16` is torchvision's, with 2×2 max pooling of stride 2. In `vgg16-shift-tolerant`, ST-LPIPS' trunk, max pooling has
+stride 1 and a 3×3 binomial blur of stride 2 follows, with two pixels reflected over each border: H ↦ ⌊H/2⌋ + 1.
 """
 
 import http.client
@@ -12,7 +9,7 @@ import itertools
 import socket
 import sys
 from pathlib import Path
-from typing import Any, ClassVar, Dict, Optional
+from typing import Any, ClassVar, Dict, Optional, Tuple
 
 import torch
 from jaxtyping import Float
@@ -35,10 +32,6 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 PLAIN_CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
 """Where VGG-16 has convolutions; VGG-19 and the variants with batch normalisation have parameters elsewhere too."""
 
-CONVOLUTIONS = ("blocks.0.0", "blocks.0.1", "blocks.1.0", "blocks.1.1", "blocks.2.0", "blocks.2.1", "blocks.2.2")
-POOLS = ("pools.0", "pools.1")
-"""Those layers of a `VGGBlock3` that may have weights."""
-
 
 class BlurPool(nn.Module):
     """Max pooling of stride 1, then a blur of stride 2: halves an image without aliasing."""
@@ -48,35 +41,30 @@ class BlurPool(nn.Module):
         self.register_buffer("filt", torch.empty(channels, 1, 3, 3))
 
     def forward(self, maps: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C h w"]:
-        """Each channel pooled and blurred, h = ⌊H/2⌋ + 1 rows and w = ⌊W/2⌋ + 1 columns."""
-        peaks = F.max_pool2d(maps, kernel_size=2, stride=1)
-        padded = F.pad(peaks, (2, 2, 2, 2), mode="reflect")
+        """Each channel pooled and blurred, h = ⌊H/2⌋ + 1 and w = ⌊W/2⌋ + 1."""
+        padded = F.pad(F.max_pool2d(maps, kernel_size=2, stride=1), (2, 2, 2, 2), mode="reflect")
         return F.conv2d(padded, self.filt, stride=2, groups=self.filt.shape[0])
 
 
 class VGGBlock3(Backbone):
-    """relu3_1, relu3_2 and relu3_3 of VGG-16, joined in this order; what both networks have in common.
-
-    Built without storage: weights are given to it, and torch's random state stays untouched.
-    """
+    """relu3_1, relu3_2 and relu3_3 of VGG-16, joined in this order; what both networks have in common."""
 
     channels = sum(BLOCK_CHANNELS[-1][1:])
     smallest_side = 8
-    """Each side is halved twice before block 3."""
-    stored: ClassVar[Dict[str, str]]
-    """What the weight file calls the layers of this module that have weights."""
+    stored: ClassVar[Tuple[str, ...]]
+    """What the weight file calls the layers that have weights, in order, convolutions first."""
+    is_blurred: ClassVar[bool] = False
 
     def __init__(self, description: BackboneDescription) -> None:
         super().__init__()
         self.description = description
-        with torch.device("meta"):
+        with torch.device("meta"):  # weights are given to it, and torch's random state stays untouched
             self.blocks = nn.ModuleList(
                 nn.ModuleList(nn.Conv2d(*pair, kernel_size=3, padding=1) for pair in itertools.pairwise(channels))
                 for channels in BLOCK_CHANNELS
             )
             self.pools = nn.ModuleList(
-                BlurPool(channels[-1]) if POOLS[0] in self.stored else nn.MaxPool2d(2)
-                for channels in BLOCK_CHANNELS[:-1]
+                BlurPool(channels[-1]) if self.is_blurred else nn.MaxPool2d(2) for channels in BLOCK_CHANNELS[:-1]
             )
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
@@ -84,7 +72,7 @@ class VGGBlock3(Backbone):
     @classmethod
     def accepts(cls, state: Dict[str, Any]) -> bool:
         """See `Backbone.accepts`."""
-        return any(str(key).rpartition(".")[0] in cls.stored.values() for key in state)
+        return any(str(key).rpartition(".")[0] in cls.stored for key in state)
 
     @classmethod
     def load(cls, weights: Weights, state: Dict[str, Any]) -> "VGGBlock3":
@@ -92,9 +80,11 @@ class VGGBlock3(Backbone):
         network, trunk = cls(weights.describe(cls.name)), {}
         try:
             _refuse_relatives(state)
+            layers = dict.fromkeys(key.rpartition(".")[0] for key in network.state_dict())
+            stored = dict(zip(layers, cls.stored, strict=True))
             for key, value in network.state_dict().items():
                 layer, _, parameter = key.rpartition(".")
-                trunk[key] = check_tensor(state, f"{cls.stored[layer]}.{parameter}", value.shape).float()
+                trunk[key] = check_tensor(state, f"{stored[layer]}.{parameter}", value.shape).float()
         except ValueError as error:
             raise InputError(
                 f"The VGG weight file {weights.path} is not VGG-16 up to relu3_3 ({error}): give torchvision's "
@@ -121,7 +111,7 @@ class VGG16(VGGBlock3):
     """torchvision's VGG-16 (IMAGENET1K_V1): from the torch hub cache, or downloaded into it."""
 
     name = "vgg16"
-    stored: ClassVar = dict(zip(CONVOLUTIONS, (f"features.{n}" for n in PLAIN_CONVOLUTIONS), strict=False))
+    stored: ClassVar = tuple(f"features.{n}" for n in PLAIN_CONVOLUTIONS[:7])
 
     @classmethod
     def find_weights(cls) -> Optional[Weights]:
@@ -148,13 +138,10 @@ class ShiftTolerantVGG16(VGGBlock3):
     """The anti-aliased trunk inside the package stlpips-pytorch, of which only the weight file is read."""
 
     name = "vgg16-shift-tolerant"
-    stored: ClassVar = dict(
-        zip(
-            (*CONVOLUTIONS, *POOLS),
-            (f"net.slice{place}" for place in ("1.0", "1.2", "2.6", "2.8", "3.12", "3.14", "3.16", "2.5", "3.11")),
-            strict=True,
-        )
+    stored: ClassVar = tuple(
+        f"net.slice{n}" for n in ["1.0", "1.2", "2.6", "2.8", "3.12", "3.14", "3.16", "2.5", "3.11"]
     )
+    is_blurred = True
 
     @classmethod
     def find_weights(cls) -> Optional[Weights]:
@@ -174,7 +161,7 @@ class ShiftTolerantVGG16(VGGBlock3):
 
 
 def _refuse_relatives(state: Dict[str, Any]) -> None:
-    """Raises a `ValueError` for VGG-19, say, which has the same shapes up to relu3_3, but other weights."""
+    """Raises a `ValueError` for VGG-19, say, whose shapes up to relu3_3 are the same."""
     for key in map(str, state):
         network, layer, *_ = [*key.split("."), ""]
         if network == "features" and not (layer.isdigit() and int(layer) in PLAIN_CONVOLUTIONS):
@@ -182,7 +169,7 @@ def _refuse_relatives(state: Dict[str, Any]) -> None:
 
 
 def _download(target: Path) -> bool:
-    """Whether torchvision's VGG-16 could be fetched. The bar of this half gigabyte is shown on a terminal only."""
+    """Whether torchvision's VGG-16, half a gigabyte, could be fetched."""
     before = socket.getdefaulttimeout()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -1,11 +1,7 @@
 """Several processes that train one model together, `--machine.num-devices N`.
 
-All hold the same model and see the same batch or view. Each renders its own share of the rays; pixels are then put
-together, so that every process has the whole picture and the same losses, and gradients are averaged before each step.
-What comes out is what one process gives, up to rounding. With one process, functions return what they were given.
-
-nerfstudio would wrap the model in DistributedDataParallel instead. That averages gradients of calls of the model's
-`forward`, which a step of hier-style doesn't go through, and names what is in a checkpoint by the number of processes.
+All see the same batch or view. Each renders its share of the rays; pixels are gathered, and gradients averaged before
+each step. nerfstudio's DistributedDataParallel would average those of `forward` only, which hier-style doesn't call.
 """
 
 import os
@@ -35,10 +31,7 @@ def shard_rays(rows: Shaped[Tensor, "rows ..."]) -> Shaped[Tensor, "own ..."]:
 
 
 def gather_rays(own: Float[Tensor, "own ..."], num_rows: int) -> Float[Tensor, "rows ..."]:
-    """All rows, from what became of each process's rows of `shard_rays`; differentiable in this process's own.
-
-    Gradients count N-fold, so that their mean over the processes is the gradient of the whole.
-    """
+    """All rows, from what became of each process's rows of `shard_rays`; differentiable in this process's own."""
     return own if num_processes() == 1 else _GatherRays.apply(own, num_rows)
 
 
@@ -54,11 +47,12 @@ class _GatherRays(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Any:
+        # N-fold: the mean over the processes is the gradient of the whole.
         return num_processes() * shard_rays(grad), None
 
 
 def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
-    """Replaces gradients by their means over all processes; the same bits in each."""
+    """Replaces gradients by their means over all processes, the same bits in each."""
     if num_processes() == 1:
         return
     for parameter in parameters:
@@ -96,10 +90,10 @@ def any_process(condition: bool, device: torch.device) -> bool:
 
 
 def prepare_launch() -> None:
-    """Makes `ns-train`, where this process is one, start several processes as it should.
+    """Has nerfstudio 1.1.5's `ns-train` start several processes as it should.
 
-    nerfstudio 1.1.5 asserts in each new process that there is CUDA, also where it is to run on the CPU; shows a
-    traceback where a process has ended with a sentence; and kills its processes on Ctrl-C before they can save.
+    It asserts that there is CUDA, also where they are to run on the CPU; shows a traceback where a process has ended
+    with a sentence; and kills its processes on Ctrl-C before they can save.
     """
     script = sys.modules.get("nerfstudio.scripts.train")
     if script is None or script.launch.__module__ == __name__:
@@ -123,22 +117,15 @@ def prepare_launch() -> None:
 
 
 def _work_on_cpu(
-    local_rank: int,
-    main_func: Callable[..., Any],
-    world_size: int,
-    num_devices_per_machine: int,
-    machine_rank: int,
-    dist_url: str,
-    config: Any,
-    timeout: Any,
-    device_type: str,
+    local_rank: int, main: Callable[..., None], world_size: int, per_machine: int, machine: int, url: str, *rest: Any
 ) -> None:
     """What one of the processes does: nerfstudio's `_distributed_worker`, without CUDA."""
+    config, timeout, _ = rest
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    rank = machine_rank * num_devices_per_machine + local_rank
+    rank = machine * per_machine + local_rank
     if "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(max(1, (os.cpu_count() or 1) // num_devices_per_machine))
+        torch.set_num_threads(max(1, (os.cpu_count() or 1) // per_machine))
     CONSOLE.quiet = rank > 0  # one of them tells
-    dist.init_process_group("gloo", init_method=dist_url, world_size=world_size, rank=rank, timeout=timeout)
-    main_func(local_rank, world_size, config, rank)
+    dist.init_process_group("gloo", init_method=url, world_size=world_size, rank=rank, timeout=timeout)
+    main(local_rank, world_size, config, rank)
     dist.destroy_process_group()

@@ -23,11 +23,7 @@ class CommandOptions:
 
 
 def exit_on_input_error(function: Callable[P, R]) -> Callable[P, R]:
-    """Makes `function`, a boundary to the command line, end the process on an `InputError`.
-
-    The message goes to stderr without a traceback and the exit status is 1. Library functions raise `InputError`
-    and leave this to the classes that nerfstudio's commands call first.
-    """
+    """Has `function`, a boundary to the command line, end the process on an `InputError`: its message, and status 1."""
 
     @functools.wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:

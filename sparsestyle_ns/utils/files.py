@@ -1,31 +1,24 @@
-"""Files that are either the former ones or the new ones, whatever happens while they are written.
-
-`write_whole` writes any file. For the one that a command was asked to make with --output-path there are
-`prepare_output`, which finds out before the work whether it can be written, and `write_output`.
-"""
+"""Files: written whole or not at all, with names that are fit for any disk and told apart."""
 
 import os
+import re
 import tempfile
-from pathlib import Path
-from typing import BinaryIO, Callable, Optional, Union
+from pathlib import Path, PurePath
+from typing import BinaryIO, Callable, Iterable, Optional, Union
 
 from sparsestyle_ns.utils.errors import InputError
+
+LONGEST, LONGEST_SUFFIX = 120, 16
+"""UTF-8 bytes of a file's name, and characters of its suffix, at most: some file systems take 143 bytes."""
 
 
 def write_whole(
     target: Path, content: Union[str, bytes, Callable[[BinaryIO], None]], temporary: Optional[Path] = None
 ) -> Path:
-    """Writes a file that gets its name only when it is whole and on the disk; returns its path.
+    """Writes a file that gets its name only when it is whole and on the disk; makes its folder; returns its path.
 
-    A failure leaves the former file as it was, and a process that is killed meanwhile also the unfinished one under
-    another name, which the next call overwrites. Folders on the way to it are made.
-
-    Args:
-        content: text, which is written in UTF-8, bytes, or a function that writes them into an open file.
-        temporary: where the unfinished file stands, on the same disk; None: beside `target`, as NAME.unfinished.
-
-    Raises:
-        OSError: the file can't be written; the former one is still there.
+    `content` is text, bytes, or a function that writes them into an open file. The unfinished file stands at
+    `temporary`, on the same disk, or beside the target. After an `OSError` the former file is still there.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     unfinished = temporary or target.with_name(target.name + ".unfinished")
@@ -49,14 +42,9 @@ def write_whole(
 
 
 def prepare_output(output_path: Path, what: str, example: str) -> None:
-    """Makes the folder that a file is to be written to.
+    """Makes the folder of a file that a command is to write; an `InputError` where that file can't be written.
 
-    Args:
-        what: what the file is, for the sentence that says why it can't be written.
-        example: a good name for such a file.
-
-    Raises:
-        InputError: the folder can't be made or written to, or the file's name is that of a folder.
+    Its sentence calls the file `what`; `example` is a good name for it.
     """
     if output_path.is_dir():
         raise InputError(f"--output-path {output_path} is a folder; name a file, such as {output_path / example}.")
@@ -68,7 +56,7 @@ def prepare_output(output_path: Path, what: str, example: str) -> None:
         raise _not_writable(output_path, what, error) from error
 
 
-def write_output(output_path: Path, content: bytes, what: str, example: str) -> Path:
+def write_output(output_path: Path, content: Union[str, bytes], what: str, example: str) -> Path:
     """Writes a file as `write_whole` does, and returns its absolute path; arguments and errors of `prepare_output`."""
     prepare_output(output_path, what, example)
     try:
@@ -81,3 +69,21 @@ def _not_writable(output_path: Path, what: str, error: OSError) -> InputError:
     return InputError(
         f"{what} can't be written to {output_path} ({error.strerror}); name another file with --output-path."
     )
+
+
+def free_name(name: str, taken: Iterable[str]) -> str:
+    """A name that isn't taken: this, else with a number behind it."""
+    taken, number = set(taken), 2
+    found = name
+    while found in taken:
+        found, number = f"{name} {number}", number + 1
+    return found
+
+
+def safe_file_name(name: str, otherwise: str) -> str:
+    """A name without folders in letters, digits, spaces and a few signs; `otherwise` where nothing of it is left."""
+    # Neither hidden, nor "..", nor an end that some file systems drop.
+    allowed = re.sub(r"[^\w .,()+-]", "_", name).strip(" .") or otherwise
+    suffix = PurePath(allowed).suffix[:LONGEST_SUFFIX]
+    room = LONGEST - len(suffix.encode())
+    return PurePath(allowed).stem.encode()[:room].decode(errors="ignore") + suffix

@@ -1,10 +1,13 @@
-"""The machine that something is measured on: what it is, whether others use it, and how much memory is taken."""
+"""The machine: what it is, whether others use it, how much memory is taken, and an ffmpeg for it."""
 
+import atexit
 import contextlib
 import importlib.metadata
 import os
 import platform
 import re
+import shutil
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -12,12 +15,13 @@ from typing import Dict, List, Tuple
 
 import psutil
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from sparsestyle_ns.utils.errors import InputError
 
 PACKAGES = ("torch", "numpy", "nerfstudio", "numba")
-BUSY_SHARE = 0.1
-"""Share of all cores that other processes may use before a figure is marked."""
-SHORTEST_WINDOW = 0.5
-"""Seconds over which load is averaged at least: the system counts time in steps of 10 ms."""
+BUSY_SHARE, SHORTEST_WINDOW = 0.1, 0.5
+"""Share of all cores that others may use before a figure is marked, and seconds over which it is averaged at least."""
 
 
 def synchronize(device: torch.device) -> None:
@@ -70,11 +74,7 @@ def others_share(earlier: Tuple[float, float], later: Tuple[float, float]) -> fl
 
 
 class LoadWatch:
-    """Says of each of many measurements whether other processes kept the machine busy meanwhile.
-
-    Use it as a context manager around each; `busy` then is the answer for the latest. A measurement shorter than
-    `SHORTEST_WINDOW` is judged together with what came right before it.
-    """
+    """Whether others kept the machine `busy` in the latest `with`; a short one is judged with what came before it."""
 
     def __init__(self) -> None:
         self.busy = False
@@ -107,3 +107,22 @@ def versions() -> Dict[str, str]:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[package] = importlib.metadata.version(package)
     return found
+
+
+def put_ffmpeg_on_path() -> None:
+    """Puts imageio-ffmpeg's ffmpeg on this process's PATH, if there is no other; an `InputError` if neither exists."""
+    if shutil.which("ffmpeg") is not None:
+        return
+    try:
+        import imageio_ffmpeg
+
+        executable = imageio_ffmpeg.get_ffmpeg_exe()
+    except (ImportError, RuntimeError) as error:
+        raise InputError(
+            "There is no ffmpeg to write videos with: install it, or `pip install imageio-ffmpeg`."
+        ) from error
+    folder = tempfile.mkdtemp(prefix="ffmpeg-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    (Path(folder) / "ffmpeg").symlink_to(executable)
+    os.environ["PATH"] = folder + os.pathsep + os.environ.get("PATH", "")
+    CONSOLE.print(f"No ffmpeg is installed; using the one in the package imageio-ffmpeg, {executable}", soft_wrap=True)

@@ -1,7 +1,6 @@
 """Inner loops that torch has no operator for, compiled by numba for the CPU.
 
-Numba's own thread pools can't be entered from two threads at once, as a viewer beside training does; so kernels are
-compiled for one thread, and the work is shared out here.
+Numba's own thread pools can't be entered from two threads at once, as a viewer does: work is shared out here.
 """
 
 import functools
@@ -18,11 +17,7 @@ R = TypeVar("R")
 
 
 def kernel(function: Callable[..., None]) -> Callable[..., None]:
-    """Compiles a function of arrays and numbers on its first call; the result is kept on disk for later processes.
-
-    The function gives its results in arrays, must stay inside their bounds (nothing checks), and runs without Python's
-    lock. Products and sums may be contracted to fused ones.
-    """
+    """Compiles a function of arrays and numbers, on its first call, to run without the GIL; nothing checks bounds."""
     options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
     try:
         return numba.njit(cache=True, **options)(function)
@@ -31,10 +26,7 @@ def kernel(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def run_on_threads(function: Callable[..., None], parts: Sequence[Tuple]) -> None:
-    """Calls `function(*part)` for each part, on as many threads as torch uses.
-
-    Parts must not write to the same places. An error in one is raised here.
-    """
+    """Calls `function(*part)` for each part, on as many threads as torch uses; an error in one is raised here."""
     threads = min(torch.get_num_threads(), len(parts))
     # Python's end has begun where the main thread is over, and then no pool takes work any more.
     if threads <= 1 or not threading.main_thread().is_alive():
@@ -53,10 +45,9 @@ def even_parts(length: int, count: int) -> Sequence[Tuple[int, int]]:
 
 
 def untraced(function: Callable[P, R]) -> Callable[P, R]:
-    """Has `function` run without the thread's trace function, which is back in place afterwards.
+    """Has `function` run without the thread's trace function, by which the viewer breaks a picture off.
 
-    The viewer breaks a picture off by an exception that its trace function raises between any two lines of Python.
-    Inside of a lock's own code, such as that of numba's compiler, that would leave the lock taken for good.
+    Its exception, inside of a lock's own code such as that of numba's compiler, would leave the lock taken for good.
     """
 
     @functools.wraps(function)

@@ -1,36 +1,23 @@
-"""HTML pages of this package: one file that needs nothing else, light or dark, made from Jinja2 templates.
-
-`templates/base.html` has what all pages share, `templates/macros.html` pictures and tables.
-"""
+"""HTML pages of this package: one file that needs nothing else, made from Jinja2 templates."""
 
 import base64
 import io
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
-from sparsestyle_ns.utils.files import prepare_output, write_output
-
 Pixels = UInt8[np.ndarray, "H W 3"]
 
 LOSSLESS_PIXELS = 200_000
 """Pictures with at most this many pixels go into a page as PNG, larger ones as JPEG."""
-EXAMPLE_NAME = "index.html"
 
 
 def render_page(template: str, package: str, **values: object) -> str:
-    """A whole page from a Jinja2 template that extends `base.html` and may use the macros of `macros.html`.
+    """A whole page from a Jinja2 template, a file in the folder `templates` of a package, filled with escaped `values`.
 
-    Everything that is put into a template is escaped. Filters for what lies inside a page: `pixels | data_uri` and
-    `content | bytes_uri("video/mp4")`. A template takes its style sheets and scripts from files, by `include`.
-
-    Args:
-        template: file name, in the folder `templates` of the package.
-        package: full name of a package, such as `sparsestyle_ns.gallery`.
-        values: what the template is filled with; it is an error to use a name that isn't there.
+    Templates have the filters `pixels | data_uri` and `content | bytes_uri("video/mp4")`.
     """
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(package), PackageLoader("sparsestyle_ns.utils")]),
@@ -54,13 +41,3 @@ def data_uri(pixels: Pixels) -> str:
 def bytes_uri(content: bytes, media_type: str) -> str:
     """A file's bytes as a data URI, of a media type such as video/mp4 or image/svg+xml."""
     return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
-
-
-def prepare_page(output_path: Path) -> None:
-    """Makes the folder that a page is to be written to; see `prepare_output`."""
-    prepare_output(output_path, "The page", EXAMPLE_NAME)
-
-
-def write_page(page: str, output_path: Path) -> Path:
-    """Writes a page's HTML and returns the file's absolute path; see `write_output`."""
-    return write_output(output_path, page.encode(), "The page", EXAMPLE_NAME)

@@ -1,37 +1,74 @@
 """How far long work is, and how long it still takes: bars on a terminal, a line now and then in a log.
 
-All bars of a process are on one display, also those of several threads and bars within bars, and what is printed
-meanwhile appears above them. Of several processes that train together, the first shows them; where CONSOLE is quiet,
-nothing is shown. A process that was started by another one tells it how far it is in a file (see `progress_file`).
+All bars of a process are on one display, above which what is printed meanwhile appears. Of several processes that train
+together, the first shows them. A process that was started by another one tells it how far it is in a small JSON file.
 """
 
+import json
 import math
+import os
 import threading
 import time
-from contextlib import contextmanager
-from typing import Iterator, Optional, Sequence, TypeVar
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Iterator, Optional, Sequence, Tuple, TypeVar
 
 from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
-from sparsestyle_ns.utils.progress_file import ProgressReport, Work, report
-
 T = TypeVar("T")
 
-SECONDS_BETWEEN_LINES = (10.0, 60.0)
-"""In a log, the least and the most time from one line to the next."""
-SHARE_BETWEEN_LINES = 0.05
-"""Share of the work after which a line comes before the most time has passed."""
+PROGRESS_FILE = "SPARSESTYLE_PROGRESS_FILE"
+"""Environment variable with that file's path; where it isn't set, nothing is written."""
+SECONDS_BETWEEN_LINES, SHARE_BETWEEN_LINES = (10.0, 60.0), 0.05
+"""In a log, the least and the most time between lines, and the share of the work after which one comes before that."""
 WORTH_A_LINE = 10.0
 """Seconds from which on finished work leaves a line that says how long it took."""
-SPEED_PERIOD = 120.0
-"""Seconds of the past by which the time left is estimated."""
-REFRESHES = 4
-"""Of the bars in a second; drawing them takes time from the work."""
 SECONDS_BETWEEN_REPORTS = 1.0
-"""Least time from one report to the process that started this one to the next."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """A piece of work that is under way; `unit` is what is counted, `iterations` for training itself."""
+
+    description: str
+    done: float
+    total: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class ProgressReport:
+    """What a process says of its work: what is under way, the outermost first."""
+
+    works: Tuple[Work, ...] = ()
+    failure: str = ""
+    """Why the process ended without finishing, one sentence; empty while all is well."""
+
+    def write(self, path: Path) -> None:
+        """Replaces the file, or raises an `OSError`."""
+        unfinished = path.with_name(path.name + ".unfinished")
+        unfinished.write_text(json.dumps(asdict(self)), encoding="utf-8")
+        os.replace(unfinished, path)  # without waiting for the disk: nobody reads it after a crash of the machine
+
+    @classmethod
+    def read(cls, path: Path) -> "ProgressReport":
+        """The newest report; an empty one before the first."""
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return cls()
+        return cls(tuple(Work(**work) for work in content["works"]), content["failure"])
+
+
+def report(content: ProgressReport) -> None:
+    """Writes a report, where this process is to write one; work doesn't stop because it can't be written."""
+    if os.environ.get(PROGRESS_FILE):
+        with suppress(OSError):
+            content.write(Path(os.environ[PROGRESS_FILE]))
 
 
 class Bar:
@@ -62,29 +99,35 @@ class Bar:
             say(line + (f", {left}" if left else "") + (f"; {note}" if note else ""))
 
     def end(self) -> None:
-        """Takes the bar away; work that took long and is finished leaves a line."""
+        """Work that took long and is finished leaves a line."""
         task = self.task
         if task.visible and task.finished and (task.finished_time or 0.0) >= WORTH_A_LINE:
             done = task.completed - task.fields["first"]
             say(f"{task.description}: {done:.0f}{self._unit} in {duration(task.finished_time)}")
-        self._display.remove_task(task.id)
 
 
 @contextmanager
 def bar(description: str, total: float, done: float = 0, unit: str = "", visible: bool = True) -> Iterator[Bar]:
-    """Shows how far some work is, within a `with`; nothing is shown where there is one thing to do in all.
-
-    The description is a word or two, `done` what was done before, and `unit` what is counted, for lines in a log.
-    """
-    with _shared_display() as display:
+    """Shows how far work of more than one step is, of which `done` was done before; lines in a log have the `unit`."""
+    global _display
+    with _lock:
+        if _display is None:
+            _display = _make_display()
+            _display.start()
+        display = _display
         number = display.add_task(
             description, total=total, completed=done, visible=visible and total > 1, first=done, note="", unit=unit
         )
-        one = Bar(display, next(task for task in display.tasks if task.id == number))
-        try:
-            yield one
-        finally:
-            one.end()
+    one = Bar(display, next(task for task in display.tasks if task.id == number))
+    try:
+        yield one
+    finally:
+        one.end()
+        with _lock:
+            display.remove_task(number)
+            if not display.tasks:
+                display.stop()
+                _display = None
 
 
 def track(items: Sequence[T], description: str) -> Iterator[T]:
@@ -127,7 +170,6 @@ class _TimeLeftColumn(ProgressColumn):
 
 _lock = threading.Lock()
 _display: Optional[Progress] = None
-_users = 0
 _reported_at = -math.inf
 
 
@@ -142,33 +184,17 @@ def _report(display: Progress) -> None:
         report(ProgressReport(tuple(works)))
 
 
-@contextmanager
-def _shared_display() -> Iterator[Progress]:
-    """The display of all bars: there while at least one is."""
-    global _display, _users
-    with _lock:
-        if _display is None:
-            can_draw = CONSOLE.is_terminal and not (CONSOLE.is_dumb_terminal or CONSOLE.quiet)
-            _display = Progress(
-                TextColumn("{task.description}", markup=False),
-                BarColumn(bar_width=30),
-                MofNCompleteColumn(),
-                _TimeLeftColumn(),
-                TextColumn("{task.fields[note]}", markup=False, style="dim"),
-                console=CONSOLE,
-                transient=True,
-                refresh_per_second=REFRESHES,
-                speed_estimate_period=SPEED_PERIOD,
-                disable=not (can_draw and comms.is_main_process()),
-            )
-            _display.start()
-        _users += 1
-        display = _display
-    try:
-        yield display
-    finally:
-        with _lock:
-            _users -= 1
-            if _users == 0:
-                display.stop()
-                _display = None
+def _make_display() -> Progress:
+    can_draw = CONSOLE.is_terminal and not (CONSOLE.is_dumb_terminal or CONSOLE.quiet)
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=30),
+        MofNCompleteColumn(),
+        _TimeLeftColumn(),
+        TextColumn("{task.fields[note]}", markup=False, style="dim"),
+        console=CONSOLE,
+        transient=True,
+        refresh_per_second=4,
+        speed_estimate_period=120.0,
+        disable=not (can_draw and comms.is_main_process()),
+    )

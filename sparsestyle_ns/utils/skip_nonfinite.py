@@ -1,6 +1,6 @@
 """Optimisers that leave everything as it is where a gradient isn't finite."""
 
-from typing import Any, Dict, Iterable, List, NamedTuple
+from typing import Any, Dict, Iterable, List, Tuple
 
 import torch
 from jaxtyping import Float
@@ -13,27 +13,15 @@ from torch.optim import Optimizer
 from sparsestyle_ns.utils.distributed import average_gradients
 
 
-class Skipped(NamedTuple):
-    """How many steps weren't taken since the optimisers were made, and since the last one that was taken."""
-
-    total: int
-    in_a_row: int
-
-
 def broken(parameters: Iterable[nn.Parameter]) -> Float[Tensor, ""]:
-    """1 where the squares of all gradients don't add up to a finite number, else 0; stays on the device.
-
-    Squares, because Adam keeps their running mean: one that overflows would stop its parameter for good.
-    """
+    """1 where the squares of all gradients don't add up to a finite number, else 0; stays on the device."""
+    # Adam keeps a running mean of squares: one that overflows would stop its parameter for good.
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     return 1.0 - torch.isfinite(get_total_norm(gradients)).float()
 
 
 def step_if_finite(optimizer: Optimizer, is_broken: Float[Tensor, ""]) -> bool:
-    """Whether to call an optimiser's step; with `is_broken` 1, parameters, means and step count stay as they are.
-
-    Fused optimisers are called with the flag and look at it where they run, so that nothing waits for a GPU.
-    """
+    """Whether to call an optimiser's step; fused ones look at the flag where they run, and nothing waits for a GPU."""
     if getattr(optimizer, "_step_supports_amp_scaling", False):
         optimizer.found_inf = is_broken
         return True
@@ -41,10 +29,9 @@ def step_if_finite(optimizer: Optimizer, is_broken: Float[Tensor, ""]) -> bool:
 
 
 class FiniteOptimizers(Optimizers):
-    """nerfstudio's optimisers; a step whose gradient isn't finite is skipped and counted.
+    """nerfstudio's optimisers, with averaged gradients; a step whose gradient isn't finite is skipped and counted.
 
-    The iteration still counts as one: learning rate, λ, view and batch go by its number, and the next one sees others.
-    Gradients are averaged over all processes before, so that all of them skip the same steps.
+    The iteration still counts as one: learning rate, λ, view and batch go by its number.
     """
 
     def __init__(self, config: Dict[str, Any], param_groups: Dict[str, List[nn.Parameter]]) -> None:
@@ -53,7 +40,7 @@ class FiniteOptimizers(Optimizers):
         self._skipped = torch.zeros(2, device=device)
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: List[str]) -> None:
-        """Steps these groups, or none of them."""
+        """Steps these groups, or none of them, alike in all processes."""
         parameters = [parameter for name in param_groups for parameter in self.parameters[name]]
         if not parameters:
             return
@@ -65,6 +52,7 @@ class FiniteOptimizers(Optimizers):
             param_groups = [name for name in param_groups if step_if_finite(self.optimizers[name], is_broken)]
         super().optimizer_scaler_step_some(grad_scaler, param_groups)
 
-    def skipped(self) -> Skipped:
-        """The counts; waits for a GPU."""
-        return Skipped(*map(int, self._skipped.tolist()))
+    def skipped(self) -> Tuple[int, int]:
+        """How many steps weren't taken in all, and since the last one that was taken; waits for a GPU."""
+        total, in_a_row = map(int, self._skipped.tolist())
+        return total, in_a_row

@@ -1,4 +1,4 @@
-"""Weight files: where they may lie on this machine, and what is read from them."""
+"""Weight files: where they lie, and what is read from them."""
 
 import importlib.util
 from pathlib import Path
@@ -16,18 +16,13 @@ def hub_file(name: str) -> Path:
 def shift_tolerant_file(name: str) -> Optional[Path]:
     """A weight file inside the package stlpips-pytorch, of which no code is run; None where there is none."""
     package = importlib.util.find_spec("stlpips_pytorch")
-    if package is None or not package.submodule_search_locations:
-        return None
-    path = Path(package.submodule_search_locations[0]) / "weights" / "vST0.0" / name
-    return path if path.is_file() else None
+    folders = package.submodule_search_locations if package else None
+    path = Path(folders[0]) / "weights" / "vST0.0" / name if folders else None
+    return path if path and path.is_file() else None
 
 
 def read_state(path: Path) -> Dict[str, Any]:
-    """A file's state dict, on the CPU.
-
-    Raises:
-        ValueError: it is damaged, or holds something else; the message completes the sentence "it is …".
-    """
+    """A file's state dict, on the CPU; a `ValueError` that completes "it is …" where it is damaged or no state dict."""
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     # A file that is no checkpoint surfaces as any of a dozen errors from the middle of torch and pickle.
@@ -39,11 +34,7 @@ def read_state(path: Path) -> Dict[str, Any]:
 
 
 def check_tensor(state: Dict[str, Any], key: str, shape: Tuple[int, ...]) -> Tensor:
-    """The tensor of a state dict under this name.
-
-    Raises:
-        ValueError: it is missing, has another shape, or isn't finite; the message says which.
-    """
+    """The tensor under this name; a `ValueError` that says so where it is missing, of another shape, or not finite."""
     value = state.get(key)
     if not isinstance(value, Tensor):
         raise ValueError(f"{key} is missing")

@@ -20,7 +20,7 @@ from sparsestyle_ns.rendering.look import RENDER_MODES, Look
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes
 from sparsestyle_ns.runs.scene_record import find_thumbnail
-from sparsestyle_ns.utils.names import free_name
+from sparsestyle_ns.utils.files import free_name
 from sparsestyle_ns.viewer.adjustments import begin_at_central_photo, hide_frustums, keep_outputs
 from sparsestyle_ns.viewer.baking import Baker
 from sparsestyle_ns.viewer.effects_panel import add_effects

@@ -5,7 +5,7 @@ import pytest
 import torch
 from test_camera_paths import ring
 
-from sparsestyle_ns.core.camera_geometry import is_forward_facing, meeting_point, viewing_spread
+from sparsestyle_ns.core.camera_paths import is_forward_facing, meeting_point, viewing_spread
 
 
 def camera_at(position, back) -> torch.Tensor:

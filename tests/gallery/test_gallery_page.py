@@ -12,7 +12,8 @@ from PIL import Image
 from sparsestyle_ns.evaluation.tables import Table
 from sparsestyle_ns.gallery.layout import THUMBNAIL_SIDE, Film, Picture, RunPictures, View, gallery_page
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.page import data_uri, write_page
+from sparsestyle_ns.utils.files import write_output
+from sparsestyle_ns.utils.page import data_uri
 
 MP4 = b"\x00\x00\x00\x18ftypmp42 the rest of a film"
 
@@ -204,9 +205,9 @@ def test_figures_are_shown_in_tables_with_a_dash_for_those_that_are_missing():
         assert text in texts
 
 
-def test_write_page_makes_the_folder_and_leaves_only_the_page(tmp_path):
+def test_writing_a_page_makes_the_folder_and_leaves_only_the_page(tmp_path):
     target = tmp_path / "new" / "folder" / "index.html"
-    assert write_page("<p>Zoë</p>", target) == target
+    assert write_output(target, "<p>Zoë</p>", "The page", "index.html") == target
     assert target.read_text(encoding="utf-8") == "<p>Zoë</p>"
     assert [path.name for path in target.parent.iterdir()] == ["index.html"]
 
@@ -220,17 +221,17 @@ def test_failed_write_leaves_the_former_page(tmp_path, monkeypatch):
 
     monkeypatch.setattr("os.replace", fail)
     with pytest.raises(InputError, match="No space left"):
-        write_page("page", target)
+        write_output(target, "page", "The page", "index.html")
     assert target.read_text() == "former"
     assert list(tmp_path.iterdir()) == [target]
 
 
 def test_page_can_not_take_a_folders_place(tmp_path):
     with pytest.raises(InputError, match=r"is a folder; name a file, such as .*index.html"):
-        write_page("page", tmp_path)
+        write_output(tmp_path, "page", "The page", "index.html")
 
 
 def test_folder_that_can_not_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError, match=r"can't be written to .*index.html"):
-        write_page("page", tmp_path / "file" / "index.html")
+        write_output(tmp_path / "file" / "index.html", "page", "The page", "index.html")

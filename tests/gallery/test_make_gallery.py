@@ -12,8 +12,7 @@ import yaml
 from nerfstudio.cameras.cameras import Cameras
 from PIL import Image
 
-from sparsestyle_ns.core.camera_geometry import meeting_point
-from sparsestyle_ns.core.camera_paths import measuring_path, showing_path
+from sparsestyle_ns.core.camera_paths import measuring_path, meeting_point, showing_path
 from sparsestyle_ns.evaluation.held_out import saved_report
 from sparsestyle_ns.gallery.film import FRAMES_PER_SECOND, encode_mp4, make_film, read_film
 from sparsestyle_ns.gallery.layout import gallery_page

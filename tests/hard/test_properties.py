@@ -42,7 +42,8 @@ from sparsestyle_ns.field_components import (
 )
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
-from sparsestyle_ns.losses import content, geometry, nnfm, reconstruction, semantic, style_index
+from sparsestyle_ns.losses import coarse as coarse_losses
+from sparsestyle_ns.losses import content, nnfm, style_index
 from sparsestyle_ns.losses import stylization as targets
 from sparsestyle_ns.rendering import baked, frozen_view, mixing, visible_samples
 from sparsestyle_ns.rendering import render as volume
@@ -60,8 +61,7 @@ COVERED = set()
 ELSEWHERE = {
     "sparsestyle_ns.field_components.hash_grid_triton": "needs CUDA or Triton's interpreter: test_hash_grid.py",
     "sparsestyle_ns.rendering.baked_kernels.march_rays": "is what march_compiled calls",
-    "sparsestyle_ns.core.camera_geometry": "takes cameras of a scene: test_camera_geometry.py",
-    "sparsestyle_ns.core.camera_paths": "takes nerfstudio's cameras: test_camera_paths.py",
+    "sparsestyle_ns.core.camera_paths": "takes cameras of a scene: test_camera_paths.py and test_camera_geometry.py",
     "sparsestyle_ns.core.schedules": "test_schedules.py and test_hard_schedules.py",
     "sparsestyle_ns.losses.stylization.default_weights": "takes no input: test_stylization.py",
     "sparsestyle_ns.losses.style_index.check_style": "refuses, and returns nothing: test_nnfm.py",
@@ -565,7 +565,7 @@ def test_neighbours_are_the_most_similar(data, count, style_count, channels, dty
         assert loss.item() == pytest.approx((1 - similarities.amax(dim=1)).mean().item(), abs=1e-5)
 
 
-@covers(content.content_loss, reconstruction.reconstruction_loss)
+@covers(content.content_loss, coarse_losses.reconstruction_loss)
 @given(st.data(), st.integers(1, 50), st.floats(-30, 30), FLOATS)
 def test_squared_errors_are_relative_and_finite(data, count, size, dtype):
     features = data.draw(tensors((count, 3), -3, 3, dtype=dtype)).requires_grad_()
@@ -575,46 +575,46 @@ def test_squared_errors_are_relative_and_finite(data, count, size, dtype):
     expected = (features - target).double().square().mean() / target.double().square().mean()
     torch.testing.assert_close(loss.double(), expected, rtol=1e-4, atol=1e-10)
     photo = target / target.max()
-    error = reconstruction.reconstruction_loss(features, photo)
-    assert error >= 0 and reconstruction.reconstruction_loss(photo, photo) == 0
+    error = coarse_losses.reconstruction_loss(features, photo)
+    assert error >= 0 and coarse_losses.reconstruction_loss(photo, photo) == 0
     for value in (loss, error):
         (gradient,) = torch.autograd.grad(value, features, retain_graph=True)
         assert gradient.isfinite().all()
 
 
-@covers(semantic.pooled_features, semantic.semantic_loss)
+@covers(coarse_losses.pooled_features, coarse_losses.semantic_loss)
 @given(st.data(), COUNTS, st.integers(1, 9), st.integers(1, 9), ALL_FLOATS)
 def test_embeddings_of_any_size_are_at_most_opposite(data, count, channels, places, dtype):
     low, high = (-4, 3) if dtype == torch.float16 else (-10, 15)
     features = data.draw(tensors((count, channels, places, 2), low, high, signed=True, dtype=dtype)).requires_grad_()
     targets = data.draw(tensors((count, channels), low, high, signed=True, dtype=dtype))
-    loss = semantic.semantic_loss(semantic.pooled_features(features), targets)
+    loss = coarse_losses.semantic_loss(coarse_losses.pooled_features(features), targets)
     assert 0 <= loss <= 2 and loss.dtype in (torch.float32, torch.float64)
     (gradient,) = torch.autograd.grad(loss, features)
     assert gradient.isfinite().all()
 
 
-@covers(geometry.matched_depth_loss)
+@covers(coarse_losses.matched_depth_loss)
 @given(st.data(), COUNTS, st.integers(1, 40))
 def test_a_ray_is_at_most_its_length_away_from_a_matched_point(data, num_rays, samples):
     depth = data.draw(tensors((num_rays, samples), -30, 2, dtype=torch.float32)).clamp(max=80)
     weights = compositing.dense_weights(depth).requires_grad_()
     edges = sampling.even_edges(num_rays, samples, torch.device("cpu"))
     aim = torch.rand(num_rays, 1, generator=torch.Generator().manual_seed(data.draw(SEEDS)))
-    loss = geometry.matched_depth_loss(weights, edges, aim)
+    loss = coarse_losses.matched_depth_loss(weights, edges, aim)
     assert -1e-6 <= loss <= 1 + 1e-5
     loss.backward()
     assert (weights.grad <= 0).all() and weights.grad.isfinite().all()
 
 
-@covers(geometry.near_density)
+@covers(coarse_losses.near_density)
 @given(st.data(), COUNTS, st.integers(1, 40), st.floats(0.001, 1))
 def test_near_density_is_at_most_the_mean_density(data, num_rays, samples, reach):
     density = data.draw(tensors((num_rays, samples), -30, 6.5, dtype=torch.float32))
     edges = sampling.even_edges(num_rays, samples, torch.device("cpu"))
-    near = geometry.near_density(density, edges, reach)
+    near = coarse_losses.near_density(density, edges, reach)
     assert 0 <= near <= density.mean() * (1 + 1e-5)
-    assert geometry.near_density(density, edges, 1.0) == pytest.approx(density.mean().item(), rel=1e-5)
+    assert coarse_losses.near_density(density, edges, 1.0) == pytest.approx(density.mean().item(), rel=1e-5)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

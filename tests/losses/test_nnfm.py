@@ -70,7 +70,7 @@ def test_length_does_not_matter_only_direction(features, style_features):
 
 def test_the_loss_is_the_mean_cosine_distance_to_the_nearest(features, style_features):
     expected = reference.nnfm_loss(features, style_features)
-    assert nnfm_loss(features, style_features, chunk_size=5).item() == pytest.approx(expected, rel=1e-12)
+    assert nnfm_loss(features, style_features).item() == pytest.approx(expected, rel=1e-12)
 
 
 def test_known_neighbours_are_used_as_they_are(features, style_features):

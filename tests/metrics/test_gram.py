@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from sparsestyle_ns.metrics.gram import gram_distance, gram_matrix
+from sparsestyle_ns.metrics.image import gram_distance, gram_matrix
 
 
 def features(count: int, seed: int) -> torch.Tensor:

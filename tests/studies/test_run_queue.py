@@ -16,7 +16,7 @@ from sparsestyle_ns.studies.paper_runs import PaperRuns
 from sparsestyle_ns.studies.run_queue import SECONDS_FILE, Run, RunQueue
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.progress_file import PROGRESS_FILE, ProgressReport
+from sparsestyle_ns.utils.progress import PROGRESS_FILE, ProgressReport
 
 PRETEND = """
 import sys, yaml
@@ -153,7 +153,7 @@ def test_time_spent_is_kept_beside_the_run(queue: RunQueue, style: Run) -> None:
 FAILING = f"""
 import os
 from pathlib import Path
-from sparsestyle_ns.utils.progress_file import ProgressReport
+from sparsestyle_ns.utils.progress import ProgressReport
 print("something else")
 ProgressReport(failure="Error: the scene is gone").write(Path(os.environ["{PROGRESS_FILE}"]))
 raise SystemExit(1)
@@ -222,7 +222,7 @@ def test_runs_beside_each_other_share_the_cores(queue: RunQueue, coarse: Run, mo
 SLOW = """
 import os, time
 from pathlib import Path
-from sparsestyle_ns.utils.progress_file import ProgressReport, Work
+from sparsestyle_ns.utils.progress import ProgressReport, Work
 works = (Work("Warm start", 3, 4, ""), Work("Stage 1", 7, 10, "iterations"))
 ProgressReport(works).write(Path(os.environ["SPARSESTYLE_PROGRESS_FILE"]))
 time.sleep(0.5)

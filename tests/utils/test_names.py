@@ -2,7 +2,7 @@
 
 import pytest
 
-from sparsestyle_ns.utils.names import LONGEST, free_name, safe_file_name
+from sparsestyle_ns.utils.files import LONGEST, free_name, safe_file_name
 
 
 def test_names_are_told_apart():

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sparsestyle_ns.utils import progress
-from sparsestyle_ns.utils.progress_file import PROGRESS_FILE, ProgressReport, Work, report
+from sparsestyle_ns.utils.progress import PROGRESS_FILE, ProgressReport, Work, report
 
 
 def test_a_report_is_read_as_it_was_written_and_is_empty_before(tmp_path: Path) -> None:
