@@ -36,13 +36,12 @@ class GalleryOptions(CommandOptions):
     """Measure runs that have no evaluation.json of their newest checkpoint, and save it in their folders."""
 
     def check(self) -> None:
-        """Makes sure that there are such runs, and that the page can be written."""
+        """Raises an `InputError` if there are no such runs, or the page can't be written."""
         if not self.runs:
             raise InputError("There is no run to show; name at least one run's folder.")
         if len(self.video) > len(self.runs):
-            raise InputError(
-                f"There are {len(self.video)} videos for {len(self.runs)} runs; give at most one for each run."
-            )
+            given = f"{len(self.video)} videos for {len(self.runs)} runs"
+            raise InputError(f"There are {given}; give at most one for each run.")
         if self.num_views < 1:
             raise InputError(f"--num-views is {self.num_views}; at least one view is needed.")
         if self.frames < 0:
