@@ -30,7 +30,7 @@ class ExportOptions(CommandOptions):
     """html: cells along a side of the scene's cube. Every browser with WebGL2 can hold 255."""
 
     def check(self) -> None:
-        """Makes sure that there is such a run, and that the file can be written."""
+        """Raises an `InputError` if there is no such run, or the file can't be written."""
         if not 32 <= self.resolution <= 1023:
             raise InputError(f"--resolution {self.resolution} isn't between 32 and 1023; 255 suits most scenes.")
         find_config(self.run, STYLE_METHOD)

@@ -36,7 +36,7 @@ class GalleryOptions(CommandOptions):
     """Measure runs that have no evaluation.json of their newest checkpoint, and save it in their folders."""
 
     def check(self) -> None:
-        """Makes sure that there are such runs, and that the page can be written."""
+        """Raises an `InputError` if there are no such runs, or the page can't be written."""
         if not self.runs:
             raise InputError("There is no run to show; name at least one run's folder.")
         if len(self.video) > len(self.runs):
