@@ -31,7 +31,7 @@ demo: $(READY)
 	$(BIN)/python data_scripts/demo.py $(DEMO)
 
 test: lint
-	$(PYTEST) --durations=5
+	$(PYTEST) -rs --durations=5
 
 lint: $(READY)
 ifdef FIX

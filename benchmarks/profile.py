@@ -46,10 +46,7 @@ def gather(times: List[Tuple[str, float]]) -> Dict[str, Any]:
         operators[part_of(operator)][operator] += time / whole
     largest = sorted(parts, key=lambda part: -parts[part])
     return {
-        part: {
-            "share": parts[part],
-            "operators": dict(sorted(operators[part].items(), key=lambda item: -item[1])[:4]),
-        }
+        part: {"share": parts[part], "operators": dict(sorted(operators[part].items(), key=lambda item: -item[1])[:4])}
         for part in largest
     }
 

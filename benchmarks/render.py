@@ -15,14 +15,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from benchmarks._measure import Measure, Options, Report, ratio_of_pairs, timed
-from benchmarks._scene import (
-    PLAIN_NOTE,
-    Scene,
-    find_or_train_coarse,
-    find_scene,
-    plain_field_of,
-    style_config,
-)
+from benchmarks._scene import PLAIN_NOTE, Scene, find_or_train_coarse, find_scene, plain_field_of, style_config
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
@@ -85,7 +78,7 @@ def main(options: RenderOptions) -> None:
         return timed(work, report.device, prepare)
 
     def picture(camera: Cameras, mode: RenderMode) -> Tensor:
-        with model.rendering(mode):
+        with model.display.rendering(mode):
             return model.get_outputs_for_camera(camera)["rgb"]
 
     exact = contender("exact", lambda camera: picture(camera, "exact"))

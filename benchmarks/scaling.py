@@ -14,11 +14,7 @@ from sparsestyle_ns.runs.coarse_run import CoarseRun
 from sparsestyle_ns.utils.errors import exit_on_input_error
 
 SIDE = 126
-COSTS = {
-    "step": "one iteration",
-    "render": "one view, exact",
-    "prepare": "freezing all views",
-}
+COSTS = {"step": "one iteration", "render": "one view, exact", "prepare": "freezing all views"}
 LABELS = {
     "pixels": "pixels of a view",
     "samples": "steps along a ray",

@@ -3,13 +3,7 @@
 import tyro
 
 from benchmarks._measure import Options, Report, ratio_of_pairs, timed
-from benchmarks._scene import (
-    PLAIN_NOTE,
-    PlainTraining,
-    find_or_train_coarse,
-    find_scene,
-    style_config,
-)
+from benchmarks._scene import PLAIN_NOTE, PlainTraining, find_or_train_coarse, find_scene, style_config
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.utils.errors import exit_on_input_error
 

@@ -2,21 +2,19 @@
 
 import copy
 import functools
-from typing import Any, Dict, Optional
+from typing import Any, Dict, Optional, Type
 
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, ViewerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig, MultiStepSchedulerConfig, SchedulerConfig
-from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from sparsestyle_ns.engine.style_trainer import HierStyleTrainer
+from sparsestyle_ns.engine.style_trainer import HierStyleTrainerConfig
 from sparsestyle_ns.engine.trainer import CoarseFewShotTrainer, SparseStyleTrainerConfig
 from sparsestyle_ns.engine.training import FusedAdamConfig
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
-from sparsestyle_ns.viewer.effects_panel import EffectsPanel
-from sparsestyle_ns.viewer.panel import StylePanel
+from sparsestyle_ns.viewer.panel import EffectsPanel, StylePanel
 
 
 def adam(lr: float, scheduler: Optional[SchedulerConfig] = None) -> Dict[str, Any]:
@@ -24,13 +22,13 @@ def adam(lr: float, scheduler: Optional[SchedulerConfig] = None) -> Dict[str, An
     return {"fields": {"optimizer": FusedAdamConfig(lr=lr), "scheduler": scheduler}}
 
 
-def method(description: str, steps_per_log: int, **settings: Any) -> MethodSpecification:
-    """A method, with what both stages have in common.
-
-    Without nerfstudio's table and its profile at the end: the trainer has a bar and a last line of its own.
-    """
+def method(
+    kind: Type[SparseStyleTrainerConfig], description: str, steps_per_log: int, **settings: Any
+) -> MethodSpecification:
+    """A method, with what both stages have in common."""
+    # Without nerfstudio's table and its profile at the end: the trainer has a bar and a last line of its own.
     local = LocalWriterConfig(enable=False)
-    config = SparseStyleTrainerConfig(
+    config = kind(
         steps_per_eval_batch=0,
         steps_per_eval_image=0,
         steps_per_eval_all_images=0,
@@ -43,14 +41,7 @@ def method(description: str, steps_per_log: int, **settings: Any) -> MethodSpeci
 
 
 def variant(of: MethodSpecification, suffix: str, description: str, settings: Dict[str, Any]) -> MethodSpecification:
-    """A method with other settings.
-
-    Args:
-        of: the method.
-        suffix: what is put behind its name.
-        description: see `MethodSpecification`.
-        settings: by their paths in the config, as their flags have them.
-    """
+    """A method with another end to its name, and other settings, by their paths in the config as flags have them."""
     config = copy.deepcopy(of.config)
     for path, value in {"method_name": of.config.method_name + suffix, **settings}.items():
         *owners, name = path.split(".")
@@ -61,6 +52,7 @@ def variant(of: MethodSpecification, suffix: str, description: str, settings: Di
 
 
 coarse_fewshot = method(
+    SparseStyleTrainerConfig,
     "Coarse radiance field from three to eight photos (stage 1).",
     _target=CoarseFewShotTrainer,
     method_name="coarse-fewshot",
@@ -72,9 +64,17 @@ coarse_fewshot = method(
     ),
     optimizers=adam(5e-4),
 )
+
+
+def coarse_fewshot_config() -> SparseStyleTrainerConfig:
+    """A copy of coarse-fewshot's config, for hier-style."""
+    return copy.deepcopy(coarse_fewshot.config)
+
+
 hier_style = method(
+    HierStyleTrainerConfig,
     "A coarse-fewshot scene in the style of a painting, --style-image FILE (stage 2).",
-    _target=HierStyleTrainer,
+    coarse_method=coarse_fewshot_config,
     method_name="hier-style",
     max_num_iterations=200,
     steps_per_save=50,
@@ -99,12 +99,20 @@ coarse_fewshot_draft = variant(
         "optimizers": adam(1e-3, ExponentialDecaySchedulerConfig(lr_final=1e-4, max_steps=2500)),
     },
 )
+
+
+def coarse_fewshot_draft_config() -> SparseStyleTrainerConfig:
+    """A copy of coarse-fewshot-draft's config, for hier-style-draft."""
+    return copy.deepcopy(coarse_fewshot_draft.config)
+
+
 hier_style_draft = variant(
     hier_style,
     "-draft",
     f"hier-style {SMALL}",
     {
         **DRAFT,
+        "coarse_method": coarse_fewshot_draft_config,
         "pipeline.model.num_steps": 64,
         "pipeline.model.occupancy_resolution": 96,
         # A quarter of the paper's, as the images are: cells finer than pixels don't reach new views.
@@ -117,7 +125,7 @@ hier_style_draft = variant(
 )
 
 
-def method_config(name: str) -> TrainerConfig:
+def method_config(name: str) -> SparseStyleTrainerConfig:
     """The config of one of this package's methods, by its name on the command line."""
     methods = (coarse_fewshot, coarse_fewshot_draft, hier_style, hier_style_draft)
     return next(method.config for method in methods if method.config.method_name == name)

@@ -146,7 +146,7 @@ def test_a_coarse_run_of_other_views_is_refused(
 def test_a_coarse_run_that_is_none_is_refused(
     runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path
 ) -> None:
-    for path, words in ((tmp_path / "nowhere", "no config.yml"), (runs.style, "a coarse-fewshot run is needed")):
+    for path, words in ((tmp_path / "nowhere", "There is no run at"), (runs.style, "name a run of coarse-fewshot")):
         flags = ["--style-image", str(painting), "--coarse-run", str(path), *TINY_STYLE]
         assert words in refusal("hier-style", llff_scene, tmp_path / "outputs", *flags)
 

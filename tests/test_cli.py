@@ -119,7 +119,7 @@ def test_ctrl_c_ends_a_command_without_a_traceback(tmp_path, capsys, monkeypatch
     def press(*given):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sparsestyle_ns.runs.run_folder.find_config", press)
+    monkeypatch.setattr("sparsestyle_ns.engine.evaluate_options.find_config", press)
     status, printed = run_main(["evaluate", str(tmp_path)], capsys)
     assert (status, printed) == (130, "")
 

@@ -114,9 +114,13 @@ class Decisions:
         """The decisions as JSON: a list `effects` of name, on, measured, threshold, reason, …"""
         return json.dumps({"effects": self.records()}, indent=1, ensure_ascii=False) + "\n"
 
+    def rows(self) -> List[Tuple[str, ...]]:
+        """The decisions as a table's lines, the first of them its heading."""
+        return [("effect", "is", "measured", "threshold", "why"), *(item.cells() for item in self.items)]
+
     def text(self) -> str:
         """The decisions as a table for a terminal."""
-        rows = [("effect", "is", "measured", "threshold", "why"), *(item.cells() for item in self.items)]
+        rows = self.rows()
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
 

@@ -6,7 +6,6 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, List, Optional, Sequence, Union
 
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
 from sparsestyle_ns.effects.base import EffectSettings
@@ -17,7 +16,6 @@ from sparsestyle_ns.utils.progress import say
 PAINTING = "PAINTING.jpg"
 """Stands for a painting that the person at the keyboard has to name."""
 RESUMING = ("--load-dir", "--load-checkpoint", "--load-step")
-"""Flags that say where training goes on."""
 
 
 def finish(made: Union[Path, str, None], command: Sequence[object]) -> None:
@@ -37,23 +35,6 @@ def after_evaluation(run: Path, stylised: bool) -> List[str]:
     return ["sparsestyle", "gallery", str(run)] if stylised else ns_train_style(run, read_coarse_run(run).config)
 
 
-def after_effects(
-    dataparser: DataParserConfig,
-    data: Path,
-    num_views: Optional[int],
-    view_ids: Optional[Sequence[int]],
-    coarse_run: Optional[Path],
-    style_image: Optional[Path],
-) -> List[str]:
-    """What follows on `sparsestyle effects`, from its arguments."""
-    command = ["ns-train", COARSE_METHOD]
-    if coarse_run is not None:
-        command = ["ns-train", STYLE_METHOD, "--style-image", str(style_image or PAINTING)]
-        command += ["--coarse-run", str(coarse_run)]
-    command += _flag("--num-views", num_views) + _flag("--view-ids", view_ids)
-    return [*command, "--data", str(data), *_parser(dataparser)]
-
-
 def after_export(run: Path, output_path: Path, format: str) -> List[object]:
     """What follows on an export: a look at a page; of a file of points or triangles, that page."""
     if format == "html":
@@ -64,15 +45,15 @@ def after_export(run: Path, output_path: Path, format: str) -> List[object]:
 def scene_arguments(config: TrainerConfig) -> List[str]:
     """The end of an ns-train command on the same scene as a run, with the same views, size and effects."""
     manager = config.pipeline.datamanager
-    arguments = _flag("--num-views", manager.num_views) + _flag("--view-ids", manager.view_ids)
-    arguments += _flag("--max-image-side", manager.max_image_side)  # methods differ in what they do without it
+    arguments = flags_of("--num-views", manager.num_views) + flags_of("--view-ids", manager.view_ids)
+    arguments += flags_of("--max-image-side", manager.max_image_side)  # methods differ in what they do without it
     arguments += _changed_flags(config.pipeline.effects, EffectSettings(), "pipeline.effects.")
-    arguments += _flag("--output-dir", config.output_dir, Path("outputs"))
-    arguments += _flag("--vis", config.vis, "viewer+tensorboard")
-    return [*arguments, "--data", str(manager.data or manager.dataparser.data), *_parser(manager.dataparser)]
+    arguments += flags_of("--output-dir", config.output_dir, Path("outputs"))
+    arguments += flags_of("--vis", config.vis, "viewer+tensorboard")
+    return [*arguments, "--data", str(manager.data or manager.dataparser.data), *parser_arguments(manager.dataparser)]
 
 
-def _parser(config: Any) -> List[str]:
+def parser_arguments(config: Any) -> List[str]:
     """A dataparser's name and those of its settings that aren't its defaults."""
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 
@@ -86,11 +67,12 @@ def _changed_flags(config: Any, default: Any, prefix: str = "") -> List[str]:
     for each in fields(config):
         value, usual = getattr(config, each.name), getattr(default, each.name)
         if each.name not in ("data", "_target") and not is_dataclass(value):
-            flags += _flag(f"--{prefix}{each.name}", value, usual)
+            flags += flags_of(f"--{prefix}{each.name}", value, usual)
     return flags
 
 
-def _flag(name: str, value: Any, usual: Any = None) -> List[str]:
+def flags_of(name: str, value: Any, usual: Any = None) -> List[str]:
+    """A flag with its value or values; nothing where that is what it usually is."""
     if value == usual:
         return []
     values = value if isinstance(value, (tuple, list)) else (value,)
@@ -98,11 +80,7 @@ def _flag(name: str, value: Any, usual: Any = None) -> List[str]:
 
 
 def resume_command(method: str, checkpoints: Path, typed: Optional[Sequence[str]] = None) -> List[str]:
-    """The command that was typed to train a method, going on from a folder of checkpoints.
-
-    Args:
-        typed: its arguments; None: this process's own.
-    """
+    """The command that trains a method on from a folder of checkpoints, otherwise as it was `typed` (None: here)."""
     typed = sys.argv[1:] if typed is None else list(typed)
     if method not in typed:  # training was begun by something else than ns-train
         return ["ns-train", method, "--load-dir", str(checkpoints)]

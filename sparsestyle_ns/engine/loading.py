@@ -3,11 +3,16 @@
 from pathlib import Path
 from typing import NamedTuple, Optional
 
+from sparsestyle_ns.engine.evaluate_options import EvaluateOptions
+from sparsestyle_ns.engine.hints import after_evaluation, finish
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.evaluation.held_out import HeldOutReport
+from sparsestyle_ns.evaluation.tables import report_tables
 from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.runs.run_folder import find_config
 from sparsestyle_ns.runs.scene_record import SceneRecord
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 
 
@@ -20,11 +25,7 @@ class LoadedRun(NamedTuple):
 
 
 def load_run(config_path: Path) -> LoadedRun:
-    """Loads a run by its config.yml; it may have been moved since it was made.
-
-    Raises:
-        InputError: the run has no checkpoint.
-    """
+    """Loads a run by its config.yml, wherever it is now; InputError where it has no checkpoint."""
     from nerfstudio.utils.eval_utils import eval_setup  # nerfstudio's own circle: it imports all methods
 
     folder = config_path.resolve().parent
@@ -46,14 +47,21 @@ def load_run(config_path: Path) -> LoadedRun:
     return LoadedRun(config, pipeline, step)
 
 
+def evaluate(options: EvaluateOptions) -> None:
+    """Measures a run by checked options, writes the report, and prints its tables; InputError as in `evaluate_run`."""
+    if options.style_image is not None:
+        Painting.read(options.style_image)
+    config = find_config(options.run)
+    report = evaluate_run(config, options.output_path, options.style_image, options.baked)
+    for table in report_tables(report.means, len(report.views)):
+        table.print()
+    finish(options.output_path, after_evaluation(config.parent, stylised="content_ssim" in report.means))
+
+
 def evaluate_run(
     config_path: Path, output_path: Path, style_image: Optional[Path] = None, baked: bool = False
 ) -> HeldOutReport:
-    """Loads a run by its config.yml, evaluates it (see `CheckedPipeline.held_out_report`), and writes the report.
-
-    Raises:
-        InputError: the run has no checkpoint.
-    """
+    """Loads a run and writes its `CheckedPipeline.held_out_report`; InputError where it has no checkpoint."""
     config, pipeline, step = load_run(config_path)
     report = pipeline.held_out_report(style_image, baked)
     report.save(output_path, config.experiment_name, config.method_name, step)

@@ -18,11 +18,7 @@ from sparsestyle_ns.utils.progress import say
 
 
 def preview_steps(shares: Sequence[float], total: int) -> FrozenSet[int]:
-    """The numbers of iterations, of `total`, after which a preview is due, from shares of them in (0, 1].
-
-    Raises:
-        InputError: a share isn't in that range.
-    """
+    """After which iterations, of `total`, a preview is due, by shares of them; InputError for one not in (0, 1]."""
     for share in shares:
         if not 0.0 < share <= 1.0:
             raise InputError(f"--previews has {share:g}, which isn't a share of the iterations above 0 and up to 1.")
@@ -48,9 +44,9 @@ def write_preview(pipeline: CheckedPipeline, run: Path, iterations: int, longest
 
 @torch.no_grad()
 def render_preview(pipeline: CheckedPipeline, longest_side: int) -> Float[Tensor, "H W 3"]:
-    """The middle one of the held-out views: photo, unstylised render where there is one, and render, side by side.
+    """The middle held-out view, side by side: photo, unstylised render where there is one, and render.
 
-    Rendered exactly, at `longest_side` pixels at most, and without leaving a trace in the state of training.
+    Rendered exactly, at `longest_side` pixels at most; the state of training stays as it is.
     """
     model, dataset = pipeline.model, pipeline.datamanager.eval_dataset
     index = len(dataset) // 2

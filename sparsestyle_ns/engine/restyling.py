@@ -1,18 +1,17 @@
 """Another style for a scene whose coarse field is there: the iterations of `ns-train hier-style`, beside a viewer.
 
-What is frozen is shared: the views' rays with the coarse field evaluated along them, photos, the features of those
-whose colours stay, and the feature network. New are a field, the painting's features, and pictures in its colours. The
-model and what is trained or shown meanwhile are only read, so that no lock is held while the field learns.
+What depends on no painting is shared and only read, so that no lock is held while the new field learns.
 """
 
 import copy
+import functools
 import shutil
 import tempfile
 import time
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
-from typing import ContextManager, Dict, Iterator, NamedTuple, Optional
+from typing import ContextManager, Dict, Iterator, NamedTuple, Optional, Tuple
 
 import torch
 import yaml
@@ -22,11 +21,10 @@ from sparsestyle_ns.effects.registry import decide_again
 from sparsestyle_ns.engine.style_trainer import style_notes
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.engine.training import check_skipped, training_step, warm_start
-from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleInputs, StyleTask
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleTask
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path, write_checkpoint
 from sparsestyle_ns.runs.run_folder import read_config
-from sparsestyle_ns.runs.scene_record import FILE_NAME as SCENE_RECORD
-from sparsestyle_ns.runs.thumbnail import save_thumbnail
+from sparsestyle_ns.runs.scene_record import RECORD_FILE, save_thumbnail
 from sparsestyle_ns.style.backbone import Backbone
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.distributed import num_processes
@@ -36,8 +34,6 @@ from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 
 SEED = 42
 """Of a new field's weights; nerfstudio's own."""
-BESIDE_CHECKPOINTS = (SCENE_RECORD, "dataparser_transforms.json")
-"""Files of a run that say nothing of the style."""
 PAINTING_FOLDER = "style_image"
 """Of a run's folder, where its painting lies under the name that it came with: no name can be that of another file."""
 
@@ -55,34 +51,22 @@ class Progress(NamedTuple):
 
 
 class Workshop:
-    """What all restylings of a scene have in common.
+    """What all restylings of a scene have in common, whose run is in a folder.
 
-    Args:
-        pipeline: of the scene.
-        folder: of its run.
-        lock: held while something changes that other threads may use: the random numbers' state.
-
-    Raises:
-        InputError: several processes train together.
+    The lock is held while something changes that other threads may use: the random numbers' state. InputError where
+    several processes train together.
     """
 
     def __init__(self, pipeline: HierStylePipeline, folder: Path, lock: ContextManager) -> None:
         if num_processes() > 1:
             raise InputError("Several processes train this scene together; restyle it in ns-viewer, once it is saved.")
         self.pipeline, self.folder, self.lock = pipeline, folder, lock
-        self._backbone: Optional[Backbone] = None
 
-    def config(self) -> SparseStyleTrainerConfig:
-        """The run's config, as it is by now; see `read_config`."""
-        return read_config(self.folder)
-
+    @functools.cached_property
     def backbone(self) -> Backbone:
         """The feature network that the pipeline has, else one with the weights that it would take."""
-        if self.pipeline.targets is not None:
-            return self.pipeline.targets.backbone
-        if self._backbone is None:
-            self._backbone = self.pipeline.config.load_backbone(self.pipeline.device)
-        return self._backbone
+        pipeline = self.pipeline
+        return pipeline.targets.backbone if pipeline.targets else pipeline.config.load_backbone(pipeline.device)
 
     def new_field(self) -> nn.Module:
         """A field as it is before training, the same each time."""
@@ -95,32 +79,30 @@ class Workshop:
 class Restyling:
     """One restyling, in steps: `for progress in restyling: …`, then `field` (σ_f and c_f) is the new style.
 
-    Args:
-        workshop: of the scene.
-        image: the painting.
-        iterations: how many, at least 1; None: as many as the run had.
+    Without a number of iterations, as many as the run had; InputError for less than 1.
     """
 
     def __init__(self, workshop: Workshop, image: Painting, iterations: Optional[int] = None) -> None:
         self.workshop, self.pipeline, self.image = workshop, workshop.pipeline, image
-        self.config = workshop.config()
+        self.config: SparseStyleTrainerConfig = read_config(workshop.folder)  # as it is by now
         self.iterations = self.config.max_num_iterations if iterations is None else iterations
         if self.iterations < 1:
             raise InputError(f"A style needs at least 1 iteration, and {self.iterations} were asked for.")
+        self._painting = Path(PAINTING_FOLDER) / safe_file_name(self.image.name, "painting")
         self.field = workshop.new_field()
         self.optimizers = FiniteOptimizers(self.config.optimizers.copy(), {"fields": list(self.field.parameters())})
 
     def __iter__(self) -> Iterator[Progress]:
         yield Progress(f"Looking at {self.image.name}")
         pipeline, total = self.pipeline, self.iterations
-        targets = pipeline.config.targets_of(StyleInputs(self.image, self.workshop.backbone()), pipeline.device)
+        targets = pipeline.config.targets_of(self.image, self.workshop.backbone, pipeline.device)
         scene = replace(pipeline.datamanager.scene, style_image=self.image.pixels)
         self.effects = decide_again(pipeline.effects, "palette", scene)  # what depends on the painting
         if pipeline.scene_views is None:
             yield Progress("Preparing the views, which the next style won't need")
         task = pipeline.new_task(self.field, targets, self.effects)
         warm_up = pipeline.config.warm_start_steps
-        for step in warm_start(pipeline, task, self.config.optimizers["fields"]["optimizer"].lr):
+        for step in warm_start(pipeline, task, self.optimizers):
             yield Progress(f"Warm start, step {step + 1} of {warm_up}", (step + 1) / (warm_up + total))
         began = time.monotonic()
         for step in range(total):
@@ -132,14 +114,12 @@ class Restyling:
 
     def _step(self, task: StyleTask, step: int) -> Dict[str, float]:
         """One iteration, as the trainer makes it."""
-        metrics: Dict[str, Tensor | float] = {}
 
-        def compute_losses(step: int) -> Dict[str, Tensor]:
+        def compute_losses() -> Tuple[Dict[str, Tensor], Dict[str, Tensor | float]]:
             _, losses = self.pipeline.losses(task, step)
-            metrics.update(losses.metrics())
-            return losses.terms()
+            return losses.terms(), losses.metrics()
 
-        training_step(self.optimizers, compute_losses, step)
+        *_, metrics = training_step(self.optimizers, compute_losses, step)
         advice = "try another image, or a lower learning rate in the run's config.yml."
         check_skipped(self.optimizers, self.config.max_skipped_steps, step, advice)
         return {name: float(value) for name, value in metrics.items()}
@@ -147,50 +127,37 @@ class Restyling:
     def save(self) -> Path:
         """Saves the style as a run of its own beside the one in the viewer; returns its folder.
 
-        The run is there as a whole or not at all: it is made in a hidden folder, which goes when something fails.
-
-        Raises:
-            OSError, RuntimeError: it can't be written; torch's writer makes the second of some of the first.
+        It is there as a whole or not at all. OSError or RuntimeError where it can't be written.
         """
         runs = self.workshop.folder.parent
         hidden = Path(tempfile.mkdtemp(prefix=".restyling-", dir=runs))
         try:
             new = hidden / "run"  # not `hidden` itself, which nobody else may read
-            new.mkdir()
             self._write_contents(new)
             while (folder := runs / datetime.now().strftime("%Y-%m-%d_%H%M%S")).exists():  # as nerfstudio names them
                 time.sleep(0.1)  # until the second is over in which another run began
-            self._write_config(new, folder.resolve())
+            config = copy.deepcopy(self.config)
+            config.timestamp, config.max_num_iterations = folder.name, self.iterations
+            config.load_dir = config.load_step = config.load_checkpoint = None
+            config.pipeline.style_image, config.pipeline.decided = folder.resolve() / self._painting, self.effects
+            write_whole(new / "config.yml", yaml.dump(config))
             return new.rename(folder)
         finally:
             shutil.rmtree(hidden, ignore_errors=True)
-
-    @property
-    def _painting(self) -> Path:
-        """Where the painting lies in a run."""
-        return Path(PAINTING_FOLDER) / safe_file_name(self.image.name, "painting")
 
     def _write_contents(self, new: Path) -> None:
         """Writes a run but for its config."""
         write_whole(new / self._painting, self.image.data)
         save_thumbnail(new, self.image)
-        for name in BESIDE_CHECKPOINTS:
+        for name in (RECORD_FILE, "dataparser_transforms.json"):  # what says nothing of the style
             if (self.workshop.folder / name).is_file():
                 shutil.copy(self.workshop.folder / name, new / name)
         self.effects.save(new)
         own = {f"_model.residual.{name}": value for name, value in self.field.state_dict().items()}
-        step = self.iterations - 1
-        path = checkpoint_path(new / self.config.relative_model_dir, step)
-        write_checkpoint(path, step, {**self.pipeline.state_dict(), **own}, self.optimizers, self.notes())
-
-    def _write_config(self, new: Path, folder: Path) -> None:
-        """Writes the config of a run that will lie in `folder`."""
-        config = copy.deepcopy(self.config)
-        config.timestamp, config.max_num_iterations = folder.name, self.iterations
-        config.load_dir = config.load_step = config.load_checkpoint = None
-        config.pipeline.style_image, config.pipeline.decided = folder / self._painting, self.effects
-        write_whole(new / "config.yml", yaml.dump(config))
+        path = checkpoint_path(new / self.config.relative_model_dir, self.iterations - 1)
+        state = {**self.pipeline.state_dict(), **own}
+        write_checkpoint(path, self.iterations - 1, state, self.optimizers, self.notes())
 
     def notes(self) -> CheckpointNotes:
         """What its checkpoint says beside the state."""
-        return style_notes(self.pipeline, self.effects, asdict(self.workshop.backbone().description))
+        return style_notes(self.pipeline, self.effects, asdict(self.workshop.backbone.description))

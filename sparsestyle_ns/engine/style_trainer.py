@@ -2,37 +2,33 @@
 
 import copy
 import shlex
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Dict, List, Literal, Optional
+from typing import Callable, Dict, List, Literal, Optional, Type
 
 import torch
+import tyro
 from nerfstudio.utils import comms, writer
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.hints import scene_arguments
-from sparsestyle_ns.engine.trainer import SparseStyleTrainer
+from sparsestyle_ns.engine.trainer import SparseStyleTrainer, SparseStyleTrainerConfig
 from sparsestyle_ns.engine.training import warm_start
 from sparsestyle_ns.field_components.tiny_cuda_grid import has_tiny_cuda_nn
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
-from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig, StyleInputs
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes
 from sparsestyle_ns.runs.coarse_run import CoarseRun, check_scene, find_coarse_run, read_coarse_run
-from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD
-from sparsestyle_ns.runs.scene_record import record_scene
-from sparsestyle_ns.runs.thumbnail import save_thumbnail
+from sparsestyle_ns.runs.run_folder import COARSE_METHOD
+from sparsestyle_ns.runs.scene_record import record_scene, save_thumbnail
 from sparsestyle_ns.utils.distributed import from_first_process
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.progress import bar
 
-PHOTO_SETTINGS = (
-    *("data", "dataparser", "num_views", "view_ids"),
-    *("max_image_side", "seed", "camera_res_scale_factor"),
-)
+PHOTO_SETTINGS = ("data", "dataparser", "num_views", "view_ids", "max_image_side", "seed", "camera_res_scale_factor")
 """Of the data manager: what both stages of a scene have in common."""
 RUN_SETTINGS = ("data", "output_dir", "experiment_name", "project_name", "machine", "logging")
 """Of the trainer: the same."""
@@ -49,15 +45,25 @@ def style_notes(pipeline: HierStylePipeline, effects: Decisions, backbone: Dict[
     }
 
 
+@dataclass
+class HierStyleTrainerConfig(SparseStyleTrainerConfig):
+    """Settings of a run of stage 2."""
+
+    _target: Type = field(default_factory=lambda: HierStyleTrainer)
+    coarse_method: tyro.conf.Suppress[Optional[Callable[[], SparseStyleTrainerConfig]]] = None
+    """Makes the config of stage 1, to train where there is no coarse run; a module's function, named in config.yml."""
+
+
 class HierStyleTrainer(SparseStyleTrainer):
     """Trains a stylised field."""
 
+    config: HierStyleTrainerConfig
     stage = "Stage 2"
     pipeline: HierStylePipeline
-    _coarse_state: Optional[Dict[str, Tensor]] = None
-    _style: StyleInputs
-    _backbone: Dict[str, str]
-    """The feature network's description; in a run that is gone on with, how it was found when that began."""
+    _coarse_run: Optional[CoarseRun] = None
+    """Of a new run."""
+    _description: Dict[str, str]
+    """Of the feature network; in a run that is gone on with, how it was found when that began."""
 
     @exit_on_input_error
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
@@ -69,57 +75,50 @@ class HierStyleTrainer(SparseStyleTrainer):
         before: CheckpointNotes = self.resumed or {}
         if "coarse_field" in before:  # not in a coarse run's; loading that says what is wrong
             _adopt_notes(pipeline, before)
-        self._style = pipeline.load_style()
-        self._backbone = asdict(self._style.backbone.description)
-        pipeline.backbone = self._backbone["name"]
-        if before.get("backbone", {}).get("sha256") == self._backbone["sha256"]:
-            self._backbone = before["backbone"]
+        self._painting, self._backbone = pipeline.load_style()
+        self._description = asdict(self._backbone.description)
+        pipeline.backbone = self._description["name"]
+        if before.get("backbone", {}).get("sha256") == self._description["sha256"]:
+            self._description = before["backbone"]
         if self.resumed is None:
-            self._check_encoding(pipeline)
             self._begin(pipeline)
         self.config = replace(self.config, pipeline=pipeline)
         super().setup(test_mode)
         if comms.is_main_process():
-            save_thumbnail(self.base_dir, self._style.painting)
+            save_thumbnail(self.base_dir, self._painting)
         if self._start_step == 0:
-            rate = self.optimizers.optimizers["fields"].param_groups[0]["lr"]
             with bar("Warm start", pipeline.warm_start_steps) as warming:
-                for _ in warm_start(self.pipeline, self.pipeline.task, rate):
+                for _ in warm_start(self.pipeline, self.pipeline.task, self.optimizers):
                     warming.advance()
 
-    def _check_encoding(self, pipeline: HierStylePipelineConfig) -> None:
+    def _begin(self, pipeline: HierStylePipelineConfig) -> None:
+        """Finds the coarse run of a new run, and decides what is simulated: as there, the rest by its field."""
         rows = pipeline.model.features_per_level
         if pipeline.model.fine_encoding == "tiny-cuda-nn" and not has_tiny_cuda_nn(torch.device(self.device), rows):
             raise InputError(
                 "--pipeline.model.fine-encoding is tiny-cuda-nn, which isn't installed here, finds no GPU, or has no "
-                f"rows of {rows} features (but of 1, 2, 4 and 8); leave the setting out: the hash grid has kernels of "
-                "its own."
+                f"rows of {rows} features (but of 1, 2, 4 and 8); leave it out: the hash grid has kernels of its own."
             )
-
-    def _begin(self, pipeline: HierStylePipelineConfig) -> None:
-        """Finds the coarse run of a new run, and decides what is simulated: as there, the rest by its field."""
         manager: FewShotDataManager = pipeline.datamanager.setup(device="cpu", test_mode="inference")
         scene = manager.scene
         decided = decide(scene, pipeline.effects)
-        run = self._coarse_run(manager, decided)
+        run = self._coarse_run = self._find_coarse(manager, decided)
         pipeline.coarse_run = run.folder.resolve()
         pipeline.model.coarse_field = copy.deepcopy(run.config.pipeline.model.coarse_field)
-        scene.coarse_density, scene.style_image = run.density(decided), self._style.painting.pixels
+        scene.coarse_density, scene.style_image = run.density(decided), self._painting.pixels
         pipeline.decided = decide(scene, pipeline.effects, decided)
-        self._coarse_state = run.model_state()
 
     def notes(self) -> CheckpointNotes:
         """See `style_notes`."""
-        return style_notes(self.pipeline, self.pipeline.effects, self._backbone)
+        return style_notes(self.pipeline, self.pipeline.effects, self._description)
 
     def _load_checkpoint(self) -> None:
         super()._load_checkpoint()
-        self.pipeline.targets = self.pipeline.config.targets_of(self._style, self.pipeline.device)
-        if self._coarse_state is not None:
-            self.pipeline.model.adopt_coarse(self._coarse_state)
-            self._coarse_state = None
+        self.pipeline.targets = self.pipeline.config.targets_of(self._painting, self._backbone, self.pipeline.device)
+        if self._coarse_run is not None:
+            self.pipeline.model.adopt_coarse(self._coarse_run.model_state())
 
-    def _coarse_run(self, manager: FewShotDataManager, decided: Decisions) -> CoarseRun:
+    def _find_coarse(self, manager: FewShotDataManager, decided: Decisions) -> CoarseRun:
         """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now."""
         scene = record_scene(manager.config.data, manager.train_dataparser_outputs, decided)
         asked = self.config.pipeline.coarse_run
@@ -128,19 +127,19 @@ class HierStyleTrainer(SparseStyleTrainer):
             check_scene(run, scene)
             CONSOLE.print(f"Stylising the coarse run {run.in_words()}.", soft_wrap=True)
             return run
-        own = self.config.method_name.replace(STYLE_METHOD, COARSE_METHOD)
+        assert self.config.coarse_method is not None
+        config = self.config.coarse_method()
+        own = config.method_name
         methods = {own, COARSE_METHOD} if own.endswith("-draft") else {own}
         found = from_first_process(find_coarse_run(self.config.output_dir, methods, scene))
         if found is not None:
             CONSOLE.print(f"Stylising the newest coarse run of this scene, {found.folder}.")
             return found
         CONSOLE.print("There is no finished coarse run of this scene and these views; training one first.")
-        return self._train_coarse(own, decided)
+        return self._train_coarse(config, decided)
 
-    def _train_coarse(self, method: str, decided: Decisions) -> CoarseRun:
-        from nerfstudio.configs.method_configs import all_methods  # nerfstudio's own circle: it imports all methods
-
-        config, ours = copy.deepcopy(all_methods[method]), self.config
+    def _train_coarse(self, config: SparseStyleTrainerConfig, decided: Decisions) -> CoarseRun:
+        ours = self.config
         for name in PHOTO_SETTINGS:
             setattr(config.pipeline.datamanager, name, copy.deepcopy(getattr(ours.pipeline.datamanager, name)))
         config.pipeline.effects, config.pipeline.decided = ours.pipeline.effects, decided
@@ -154,12 +153,11 @@ class HierStyleTrainer(SparseStyleTrainer):
             config.save_config()
         trainer = config.setup(local_rank=self.local_rank, world_size=self.world_size)
         trainer.setup()
-        trainer.train_to_end()
-        if trainer._interrupted:
-            resume = ["ns-train", method, "--load-dir", str(trainer.checkpoint_dir), *scene_arguments(config)]
+        if not trainer.train_to_end():
+            resume = ["ns-train", config.method_name, "--load-dir", str(trainer.checkpoint_dir)]
             raise InputError(
                 "The coarse run was interrupted, so there is nothing to stylise yet; finish it with "
-                f"{shlex.join(resume)} and run this command again."
+                f"{shlex.join([*resume, *scene_arguments(config)])} and run this command again."
             )
         for state in (writer.EVENT_WRITERS, writer.EVENT_STORAGE, writer.GLOBAL_BUFFER):
             state.clear()
@@ -172,10 +170,8 @@ class HierStyleTrainer(SparseStyleTrainer):
 
 
 def _adopt_notes(pipeline: HierStylePipelineConfig, notes: CheckpointNotes) -> None:
-    """Takes from the run that is resumed what was found out when it began: the coarse field, and what auto was.
-
-    Its config.yml may be this command's own by now, where training goes on in the same folder.
-    """
+    """Takes from the run that is resumed what was found out when it began: the coarse field, and what auto was."""
+    # Not from its config.yml: that may be this command's own by now, where training goes on in the same folder.
     pipeline.model.coarse_field = CoarseFieldConfig(**notes["coarse_field"])
     pipeline.coarse_run = Path(notes["coarse_run"])
     if pipeline.model.fine_encoding == "auto":

@@ -13,7 +13,6 @@ from typing import Any, ClassVar, Dict, List, Literal, Optional, Tuple, Type
 import torch
 import yaml
 from nerfstudio.configs.base_config import MachineConfig
-from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import comms, writer
 from nerfstudio.utils.decorators import check_main_thread, check_viewer_enabled
@@ -26,13 +25,8 @@ from sparsestyle_ns.engine.previews import preview_steps, write_preview
 from sparsestyle_ns.engine.training import check_skipped, training_step
 from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
-from sparsestyle_ns.runs.checkpoints import (
-    CheckpointNotes,
-    checkpoint_path,
-    load_checkpoint,
-    newest_checkpoint,
-    write_checkpoint,
-)
+from sparsestyle_ns.runs import checkpoints
+from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path
 from sparsestyle_ns.runs.scene_record import record_scene
 from sparsestyle_ns.utils.distributed import any_process, prepare_launch, share_state
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
@@ -42,7 +36,6 @@ from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 
 STEPS_PER_LOOK = 10
 """Iterations between looks at the count of skipped steps, each of which waits for a GPU."""
-
 
 warnings.filterwarnings("ignore", message="Using a non-tuple sequence", module="nerfstudio")
 warnings.filterwarnings("ignore", message="Sparse invariant checks are implicitly disabled")
@@ -72,23 +65,20 @@ class SparseStyleTrainerConfig(TrainerConfig):
     @exit_on_input_error
     def save_config(self) -> None:
         """Writes config.yml into the run's folder; `ns-train` calls it right before it starts processes."""
-        gpus = torch.cuda.device_count()
-        if self.machine.device_type == "cuda" and self.machine.num_devices > gpus:
+        machine, folder, gpus = self.machine, self.get_base_dir(), torch.cuda.device_count()
+        if machine.device_type == "cuda" and machine.num_devices > gpus:
+            advice = "ask for fewer." if gpus else "give --machine.device-type cpu."
             raise InputError(
-                f"--machine.device-type is cuda and --machine.num-devices {self.machine.num_devices}, but torch finds "
-                f"{gpus or 'no'} GPU{'s' * (gpus > 1)} here; "
-                + ("ask for fewer." if gpus else "give --machine.device-type cpu.")
+                f"--machine.device-type is cuda and --machine.num-devices {machine.num_devices}, but torch finds "
+                f"{gpus or 'no'} GPU{'s' * (gpus > 1)} here; {advice}"
             )
-        if self.machine.num_devices * self.machine.num_machines > 1:
+        if machine.num_devices * machine.num_machines > 1:
             prepare_launch()
         try:
-            self.get_base_dir().mkdir(parents=True, exist_ok=True)
-            write_whole(self.get_base_dir() / "config.yml", yaml.dump(self))
+            write_whole(folder / "config.yml", yaml.dump(self))
         except OSError as error:
-            raise InputError(
-                f"The run can't be saved in {self.get_base_dir()} ({error.strerror}); name a folder that can be "
-                "written to with --output-dir."
-            ) from error
+            where = f"{folder} ({error.strerror}); name a folder that can be written to with --output-dir."
+            raise InputError(f"The run can't be saved in {where}") from error
 
 
 class SparseStyleTrainer(Trainer, ABC):
@@ -118,12 +108,11 @@ class SparseStyleTrainer(Trainer, ABC):
             record_scene(manager.config.data, manager.train_dataparser_outputs, effects).save(self.base_dir)
             self._save_decisions()
 
-    def setup_optimizers(self) -> Optimizers:
+    def setup_optimizers(self) -> FiniteOptimizers:
         """Optimisers that skip steps whose gradient isn't finite."""
         return FiniteOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
 
     def _save_decisions(self) -> None:
-        """Writes which effects are simulated into effects.json, and into config.yml, from which a run is loaded."""
         self.pipeline.effects.save(self.base_dir)
         self._saved_decisions = self.pipeline.effects
         self.config.save_config()
@@ -132,25 +121,24 @@ class SparseStyleTrainer(Trainer, ABC):
     def resumed(self) -> Optional[Dict[str, Any]]:
         """What is in the checkpoint that training goes on from, until it is loaded; None for a new run."""
         checkpoint = self._resumed_checkpoint()
-        return None if checkpoint is None else load_checkpoint(checkpoint)
+        return None if checkpoint is None else checkpoints.load_checkpoint(checkpoint)
 
     def _resumed_checkpoint(self) -> Optional[Path]:
         for source in (self.config.load_dir, self.config.load_checkpoint):
             if source is not None and not source.exists():
                 raise InputError(
-                    f"There is nothing to resume at {source}; name a folder of checkpoints or a .ckpt file."
+                    f"There is nothing to resume at {source}; name a folder of checkpoints or one of them."
                 )
         folder, step = self.config.load_dir, self.config.load_step
         if folder is None:
             return self.config.load_checkpoint
-        checkpoint = newest_checkpoint(folder) if step is None else checkpoint_path(folder, step)
+        checkpoint = checkpoints.newest_checkpoint(folder) if step is None else checkpoint_path(folder, step)
         if checkpoint is None or not checkpoint.is_file():
             what = "checkpoint" if step is None else f"checkpoint of iteration {step}"
             raise InputError(f"There is no {what} in {folder}; name a run's nerfstudio_models folder.")
         return checkpoint
 
     def _load_checkpoint(self) -> None:
-        """Takes over all of a checkpoint, as nerfstudio does."""
         state = self.resumed
         if state is not None:
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
@@ -169,17 +157,16 @@ class SparseStyleTrainer(Trainer, ABC):
         self.train_to_end()
         self.finish()
 
-    def train_to_end(self) -> None:
+    def train_to_end(self) -> bool:
         """Trains up to `max_num_iterations`, counted from the very first iteration, also when resuming.
 
         Ctrl-C ends training after the iteration that is under way and saves a checkpoint; a second one stops at once.
+        Returns whether training came to its end.
         """
         total = self.config.max_num_iterations
         if self._start_step >= total:
-            raise InputError(
-                f"The checkpoint is of iteration {self._start_step}, and --max-num-iterations is {total}; raise it to "
-                "train on."
-            )
+            done = f"The checkpoint is of iteration {self._start_step}"
+            raise InputError(f"{done}, and --max-num-iterations is {total}; raise it to train on.")
         self._interrupted = False
         former = signal.signal(signal.SIGINT, self._on_interrupt)
         has_table = self.config.logging.local_writer.enable  # nerfstudio's, which would write over the bar
@@ -193,6 +180,7 @@ class SparseStyleTrainer(Trainer, ABC):
             CONSOLE.print(f"Stopped after iteration {self.step + 1} of {total}; the checkpoint is saved.")
         finally:
             signal.signal(signal.SIGINT, former)
+        return not self._interrupted
 
     def _after_train(self) -> None:
         self._bars.close()  # a viewer may stay open for hours after training
@@ -202,7 +190,7 @@ class SparseStyleTrainer(Trainer, ABC):
 
     @check_viewer_enabled
     def _train_complete_viewer(self) -> None:
-        """The viewer stays until Ctrl-C, with which the command ends as well as without a viewer."""
+        """The viewer stays until Ctrl-C, which ends the command as if there were none."""
         self.finish()
         try:
             super()._train_complete_viewer()
@@ -218,17 +206,13 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def train_iteration(self, step: int) -> Tuple[Tensor, Dict[str, Tensor], Dict[str, Tensor]]:
         """One iteration: its loss, the losses by name, and metrics."""
-        losses: Dict[str, Tensor] = {}
-        metrics: Dict[str, Tensor] = {}
 
-        def compute_losses(step: int) -> Dict[str, Tensor]:
-            nonlocal losses, metrics
+        def compute_losses() -> Tuple[Dict[str, Tensor], Dict[str, Tensor]]:
             with torch.autocast(self.pipeline.device.type, enabled=self.mixed_precision):
-                _, losses, metrics = self.pipeline.get_train_loss_dict(step)
-            return losses
+                return self.pipeline.get_train_loss_dict(step)[1:]
 
-        accumulate = self.gradient_accumulation_steps
-        loss = training_step(self.optimizers, compute_losses, step, self.grad_scaler, accumulate)
+        scaling = self.grad_scaler, self.gradient_accumulation_steps
+        loss, losses, metrics = training_step(self.optimizers, compute_losses, step, *scaling)
         self._log_step(step, metrics)
         self.stop_training = step + 1 == self.config.max_num_iterations  # nerfstudio counts from where it resumed
         return loss, losses, metrics
@@ -251,10 +235,8 @@ class SparseStyleTrainer(Trainer, ABC):
         """Reports steps that were skipped since the last look; returns how many were in a row up to now."""
         total, _ = self.optimizers.skipped()
         if total > self._reported:
-            CONSOLE.print(
-                f"Steps skipped up to iteration {step + 1}, because their gradients weren't finite: "
-                f"{total - self._reported} ({total} in all)."
-            )
+            new = f"{total - self._reported} ({total} in all)"
+            CONSOLE.print(f"Steps skipped up to iteration {step + 1}, because their gradients weren't finite: {new}.")
             writer.put_scalar(name="Skipped Steps", scalar=total, step=step)
             self._reported = total
         kept = "No checkpoint was saved before."
@@ -291,21 +273,18 @@ class SparseStyleTrainer(Trainer, ABC):
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Saves a checkpoint as nerfstudio does, but only whole and finite ones, and drops the former one after that.
+        """Saves a checkpoint as nerfstudio does, but only a whole and finite one, and drops the former one after that.
 
-        While steps are being skipped, the state is under suspicion: nothing is saved then, and at the end of training
-        the former checkpoint is kept beside the last.
+        While steps are being skipped nothing is saved; at the end of training the former checkpoint is kept then.
         """
         suspect = self._look_at_skipped(step) > 0
         if suspect and not self._interrupted and step + 1 < self.config.max_num_iterations:
             CONSOLE.print(f"No checkpoint of iteration {step + 1}: its step was skipped.")
             return
-        target, unfinished = checkpoint_path(self.checkpoint_dir, step), self.base_dir / "checkpoint.unfinished"
-        content = step, self.pipeline.state_dict(), self.optimizers, self.notes(), self.grad_scaler
+        target, state = checkpoint_path(self.checkpoint_dir, step), self.pipeline.state_dict()
         try:
-            write_checkpoint(target, *content, unfinished)
+            checkpoints.write_checkpoint(target, step, state, self.optimizers, self.notes(), self.grad_scaler)
         except (OSError, RuntimeError) as error:  # torch's writer makes a RuntimeError of some OSErrors
-            unfinished.unlink(missing_ok=True)
             raise InputError(
                 f"The checkpoint of iteration {step + 1} can't be saved in {self.checkpoint_dir} ({error}); the former "
                 "one is still there. Make room, and go on from it with --load-dir."

@@ -4,7 +4,7 @@ import copy
 import functools
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Callable, Dict, Iterator, Mapping, Optional, Tuple
+from typing import Any, Callable, Dict, Iterator, Mapping, Optional, Tuple
 
 import torch
 from jaxtyping import Float
@@ -33,27 +33,24 @@ class FusedAdamConfig(AdamOptimizerConfig):
 
 def training_step(
     optimizers: Optimizers,
-    compute_losses: Callable[[int], Mapping[str, Float[Tensor, ""]]],
+    compute_losses: Callable[[], Tuple[Dict[str, Float[Tensor, ""]], Dict[str, Any]]],
     step: int,
     scaler: Optional[GradScaler] = None,
     accumulate: Optional[Mapping[str, int]] = None,
-) -> Float[Tensor, ""]:
-    """Minimises a sum of losses by one step of the optimisers and their schedules.
+) -> Tuple[Float[Tensor, ""], Dict[str, Float[Tensor, ""]], Dict[str, Any]]:
+    """Minimises a sum of losses by one step of the optimisers and their schedules; returns it, the losses and metrics.
 
     Args:
-        optimizers: of all parameters that learn.
-        compute_losses: gives the losses of an iteration by name, weighted.
+        compute_losses: gives the losses by name, weighted, and metrics.
         step: the iteration, from 0.
-        scaler: of gradients, for half precision; None: gradients as they are.
+        scaler: of gradients, for half precision.
         accumulate: of a group of parameters, the iterations whose gradients are added up for a step; 1 if not named.
-
-    Returns:
-        The sum, without its gradient.
     """
     scaler, every = scaler or GradScaler(enabled=False), accumulate or {}
     groups = list(optimizers.parameters)
     optimizers.zero_grad_some([name for name in groups if step % every.get(name, 1) == 0])
-    loss = functools.reduce(torch.add, compute_losses(step).values())
+    losses, metrics = compute_losses()
+    loss = functools.reduce(torch.add, losses.values())
     scaler.scale(loss).backward()
     due = [name for name in groups if (step + 1) % every.get(name, 1) == 0]
     optimizers.optimizer_scaler_step_some(scaler, due)
@@ -62,30 +59,27 @@ def training_step(
     if scale <= scaler.get_scale():  # a smaller one says that the step was skipped
         for scheduler in optimizers.schedulers.values():
             scheduler.step()
-    return loss.detach()
+    return loss.detach(), losses, metrics
 
 
-def warm_start(pipeline: HierStylePipeline, task: StyleTask, learning_rate: float) -> Iterator[int]:
+def warm_start(pipeline: HierStylePipeline, task: StyleTask, following: Optimizers) -> Iterator[int]:
     """Fits a new style's colours to whole photos (`HierStylePipeline.warm_start_loss`); an iterator of its steps.
 
-    Args:
-        pipeline: of the scene.
-        task: the field and its views.
-        learning_rate: Adam's; that of the iterations that follow.
+    By an Adam of its own, with the learning rate of the optimisers of the iterations that follow.
     """
-    adam = {"fields": {"optimizer": FusedAdamConfig(lr=learning_rate), "scheduler": None}}
+    rate = following.config["fields"]["optimizer"].lr
+    adam = {"fields": {"optimizer": FusedAdamConfig(lr=rate), "scheduler": None}}
     optimizers = FiniteOptimizers(adam, {"fields": list(task.style.parameters())})
     for step in range(pipeline.config.warm_start_steps):
-        training_step(optimizers, lambda step: pipeline.warm_start_loss(task, step), step)
+        training_step(optimizers, lambda step=step: (pipeline.warm_start_loss(task, step), {}), step)
         yield step
     optimizers.zero_grad_all()
 
 
 def check_skipped(optimizers: FiniteOptimizers, most: int, step: int, advice: str) -> int:
-    """How many steps were skipped in a row up to now, because their gradients weren't finite; waits for a GPU.
+    """How many steps up to iteration `step` were skipped in a row, as gradients weren't finite; waits for a GPU.
 
-    Raises:
-        InputError: there are `most` or more, up to iteration `step`; the sentence ends with `advice`.
+    InputError, ending with `advice`, where there are `most` or more.
     """
     _, in_a_row = optimizers.skipped()
     if in_a_row >= most:
@@ -97,12 +91,10 @@ def check_skipped(optimizers: FiniteOptimizers, most: int, step: int, advice: st
 
 
 class Training:
-    """A method's training without nerfstudio's trainer: iterations that can be timed one by one.
+    """Training of any nerfstudio method without its trainer: iterations that can be timed one by one.
 
     Args:
-        config: of any nerfstudio method.
-        device: where to train.
-        coarse_state: the state of the coarse model that a stylised one builds on.
+        coarse_state: of the coarse model that a stylised one builds on.
         prepare: called with the pipeline before its training is set up; may give it what other runs have made.
     """
 
@@ -113,23 +105,18 @@ class Training:
         coarse_state: Optional[Dict[str, Tensor]] = None,
         prepare: Optional[Callable[[VanillaPipeline], None]] = None,
     ) -> None:
-        self.pipeline: VanillaPipeline = config.pipeline.setup(
-            device=str(device), test_mode="val", world_size=1, local_rank=0
-        )
+        self.pipeline: VanillaPipeline = config.pipeline.setup(device=str(device), test_mode="val")
         if coarse_state is not None:
             self.pipeline.model.adopt_coarse(coarse_state)
         if prepare is not None:
             prepare(self.pipeline)
         kind = FiniteOptimizers if isinstance(self.pipeline, CheckedPipeline) else Optimizers
         self.optimizers = kind(copy.deepcopy(config.optimizers), self.pipeline.get_param_groups())
-        trainer = SimpleNamespace(config=config)
-        self.callbacks = self.pipeline.get_training_callbacks(
-            TrainingCallbackAttributes(self.optimizers, None, self.pipeline, trainer)
-        )
+        attributes = TrainingCallbackAttributes(self.optimizers, None, self.pipeline, SimpleNamespace(config=config))
+        self.callbacks = self.pipeline.get_training_callbacks(attributes)
         self.num_steps = 0
         if isinstance(self.pipeline, HierStylePipeline):
-            rate = self.optimizers.optimizers["fields"].param_groups[0]["lr"]
-            for _ in warm_start(self.pipeline, self.pipeline.task, rate):
+            for _ in warm_start(self.pipeline, self.pipeline.task, self.optimizers):
                 pass
 
     def step(self) -> Tensor:
@@ -137,6 +124,7 @@ class Training:
         self.pipeline.train()
         for callback in self.callbacks:
             callback.run_callback_at_location(self.num_steps, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-        loss = training_step(self.optimizers, lambda step: self.pipeline.get_train_loss_dict(step)[1], self.num_steps)
+        step = self.num_steps
+        loss, *_ = training_step(self.optimizers, lambda: self.pipeline.get_train_loss_dict(step)[1:], step)
         self.num_steps += 1
         return loss

@@ -1,4 +1,4 @@
-"""What a run is worth on the views it hasn't seen: how true the coarse field is, how stylised the stylised one."""
+"""What a run is worth on views that it hasn't seen: how true the coarse field is, how stylised the stylised one."""
 
 import json
 import statistics
@@ -19,10 +19,11 @@ from sparsestyle_ns.core.occupancy import interval_lengths
 from sparsestyle_ns.core.precision import autocast
 from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.volrend import dense_weights, effective_samples, optical_depth
-from sparsestyle_ns.evaluation.path_frames import render_path
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID
+from sparsestyle_ns.metrics.consistency import RANGES, PathGeometry
 from sparsestyle_ns.metrics.image import gram_distance, gram_matrix, image_metrics, psnr
+from sparsestyle_ns.metrics.warping import MIN_COVERAGE, Pinhole, Surface
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.runs.run_folder import REPORT_FILE
@@ -30,7 +31,7 @@ from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.progress import track
 
 EVEN_SAMPLES = 64
-"""Even samples a ray on which `mean_effective_samples` counts: the number means something only with this one."""
+"""Even samples a ray on which `effective_samples` are counted: the number means something only with this one."""
 MIN_ACCUMULATION = 0.5
 """Rays with less weight than this show background, and have no surface to be sharp."""
 
@@ -43,21 +44,13 @@ class HeldOutReport:
     """Over the held-out views, and for a stylised run those over pairs of the measuring path."""
     views: List[Dict[str, float]]
     """The held-out views' own values."""
-    rays: List[int] = field(default_factory=list)
-    """Each view's pixels; not in a file."""
-    seconds: List[float] = field(default_factory=list)
-    """How long each view took to render; not in a file."""
+    speed: Dict[str, float] = field(default_factory=dict)
+    """Of rendering: `num_rays_per_sec` and `fps`, means over the views; not in a file."""
 
     def deviations(self) -> Dict[str, float]:
         """As `…_std`, the standard deviations between views; nothing of what fewer than two views have."""
         found = by_figure(self.views)
         return {f"{key}_std": statistics.stdev(values) for key, values in found.items() if len(values) > 1}
-
-    def speed(self) -> Dict[str, float]:
-        """`num_rays_per_sec` and `fps`, means over the views."""
-        rates = [rays / seconds for rays, seconds in zip(self.rays, self.seconds, strict=True)]
-        fps = statistics.fmean(1.0 / seconds for seconds in self.seconds)
-        return {"num_rays_per_sec": statistics.fmean(rates), "fps": fps}
 
     def save(self, path: Path, experiment: str, method: str, step: int) -> None:
         """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means."""
@@ -80,6 +73,11 @@ def by_figure(views: Sequence[Dict[str, float]]) -> Dict[str, List[float]]:
     return {name: [view[name] for view in views if name in view] for name in names}
 
 
+def means_of(views: Sequence[Dict[str, float]]) -> Dict[str, float]:
+    """Each figure's mean over the views that have it."""
+    return {name: statistics.fmean(values) for name, values in by_figure(views).items()}
+
+
 @torch.no_grad()
 def evaluate_held_out(
     model: Union[CoarseFewShotModel, HierStyleModel],
@@ -89,49 +87,43 @@ def evaluate_held_out(
     baked: bool = False,
     picture_folder: Optional[Path] = None,
 ) -> HeldOutReport:
-    """Evaluates a model on views that it hasn't seen, and on the measuring path.
+    """Evaluates a model in evaluation on views that it hasn't seen, and on the measuring path, all by exact renders.
 
     Coarse model: `psnr` in dB, `ssim`, `lpips` and `st_lpips` where there are weights, and `effective_samples`.
     Stylised model: the same of the coarse field with the prefix `coarse_`; `content_ssim`; with `targets` what
     `stylisation_figures` gives and, where there are weights for it, `art_fid` of all views, with photos as content; and
-    the consistency of frames on the measuring path (`PathFrames.figures`), where there are the two training cameras
-    that it takes. All of these are of exact renders.
+    the consistency of frames on the measuring path (`PathFrames.figures`), where there are two training cameras.
 
     Args:
-        model: in evaluation.
-        views: photos and their cameras.
-        training_cameras: those that the measuring path leads through.
         targets: the painting's features, for a stylised model.
         baked: whether a stylised model's baked renders are held against the exact ones as well (`baked_psnr`, in dB).
-        picture_folder: where to save the views as pictures, beside their photos; None for nowhere.
+        picture_folder: where to save the views as pictures, beside their photos.
     """
     style = None if isinstance(model, CoarseFewShotModel) else _StyleMeasure(model, targets, baked)
-    values, rays, seconds = [], [], []
+    values, speeds = [], []
     for index in track(range(len(views)), "Held-out views"):
         camera = views.cameras[index : index + 1].to(model.device)
         photo = views[index]["image"][..., :3]
         start = time.perf_counter()
         outputs = exact_outputs(model, camera)
-        seconds.append(time.perf_counter() - start)
-        rays.append(photo.shape[0] * photo.shape[1])
+        fps = 1.0 / (time.perf_counter() - start)
+        speeds.append({"num_rays_per_sec": fps * photo.shape[0] * photo.shape[1], "fps": fps})
         if style is not None:
             values.append(style.view(outputs, photo, camera))
         else:
-            effective = mean_effective_samples(model, camera)
-            extra = {} if effective is None else {"effective_samples": effective}
-            values.append({**image_metrics(outputs["rgb"], photo), **extra})
+            values.append({**image_metrics(outputs["rgb"], photo), **sharpness_figures(model, camera)})
         if picture_folder is not None:
             picture_folder.mkdir(parents=True, exist_ok=True)
             _, pictures = model.get_image_metrics_and_images(outputs, {"image": photo})
             for name, picture in pictures.items():
                 save_image(picture.permute(2, 0, 1).cpu(), picture_folder / f"eval_{name}_{index:04d}.png")
-    means = {key: statistics.fmean(found) for key, found in by_figure(values).items()}
+    means = means_of(values)
     if style is not None:
         if style.art_fid is not None:
             means.update(style.art_fid.figures())
         if len(training_cameras) > 1:
             means.update(render_path(model, measuring_path(training_cameras)).figures())
-    return HeldOutReport(means, values, rays, seconds)
+    return HeldOutReport(means, values, means_of(speeds))
 
 
 class _StyleMeasure:
@@ -152,16 +144,16 @@ class _StyleMeasure:
         if self.art_fid is not None:
             self.art_fid.add(stylised, photo)
         if self.baked:
-            with model.rendering("baked"):
+            with model.display.rendering("baked"):
                 values["baked_psnr"] = psnr(model.get_outputs_for_camera(camera)["rgb"], stylised)
         return values
 
 
 def exact_outputs(model: Union[CoarseFewShotModel, HierStyleModel], camera: Cameras) -> Dict[str, Tensor]:
-    """A camera's outputs, of a stylised run in exact rendering whatever its own mode is; a coarse run has no other."""
+    """A camera's outputs in exact rendering, whatever a stylised model's own mode is; a coarse one has no other."""
     if isinstance(model, CoarseFewShotModel):
         return model.get_outputs_for_camera(camera)
-    with model.rendering("exact"):
+    with model.display.rendering("exact"):
         return model.get_outputs_for_camera(camera)
 
 
@@ -172,11 +164,10 @@ def stylisation_figures(
     stylised: Float[Tensor, "H W 3"],
     accumulation: Optional[Float[Tensor, "H W"]],
 ) -> Dict[str, float]:
-    """How strong the style of a view is, before and after stylising, and how far its content has moved.
+    """How strong the style of a view is, before (`…_before`) and after stylising, and how far its content has moved.
 
-    `style_loss` is the nearest neighbour feature matching of Eq. 5, `content_loss` the distance of features (Eq. 5)
-    from the unstylised view, and any other loss of `targets` likewise `NAME_loss`; `gram_distance` is that of
-    `metrics.image`. All but the content loss come with their value for the unstylised view, as `…_before`. With
+    `style_loss` and `content_loss` are Eq. 5's: nearest neighbour feature matching, and the features' distance from the
+    unstylised view; other losses of `targets` are `NAME_loss`, and `gram_distance` is that of `metrics.image`. With
     `accumulation`, only where the scene covers the picture: a background can't be stylised.
     """
     content = targets.features(coarse)
@@ -191,11 +182,8 @@ def stylisation_figures(
 
 
 @torch.no_grad()
-def mean_effective_samples(model: CoarseFewShotModel, camera: Cameras) -> Optional[float]:
-    """Mean of `effective_samples` over a view's rays that meet a surface, on `EVEN_SAMPLES` even samples.
-
-    None where no ray does: JSON has no word for a mean of nothing.
-    """
+def sharpness_figures(model: CoarseFewShotModel, camera: Cameras) -> Dict[str, float]:
+    """Mean `effective_samples`, on `EVEN_SAMPLES` even ones, of a view's rays that meet a surface, where one does."""
     rays = camera.generate_rays(camera_indices=0, keep_shape=False).flatten()
     counts = []
     for start in range(0, len(rays), model.config.eval_num_rays_per_chunk):
@@ -207,4 +195,39 @@ def mean_effective_samples(model: CoarseFewShotModel, camera: Cameras) -> Option
         weights = dense_weights(optical_depth(density, interval_lengths(segments, edges, model.space.unbounded)))
         counts.append(effective_samples(weights)[weights.sum(dim=-1) > MIN_ACCUMULATION])
     found = torch.cat(counts)
-    return float(found.mean()) if len(found) else None
+    return {"effective_samples": float(found.mean())} if len(found) else {}
+
+
+@dataclass
+class PathFrames:
+    """Frames of the measuring path, and what they show of the unstylised scene; on the CPU."""
+
+    stylised: List[Float[Tensor, "H W 3"]]
+    coarse: List[Float[Tensor, "H W 3"]]
+    surfaces: List[Surface]
+
+    def figures(self) -> Dict[str, float]:
+        """Consistency of the stylised frames, `ceiling_…` of the unstylised ones, and `…_visible` shares of pixels."""
+        geometry = PathGeometry(self.surfaces)
+        values = geometry.consistency(self.stylised)
+        values.update({f"ceiling_{key}": value for key, value in geometry.consistency(self.coarse).items()})
+        shares = {f"{name}_visible": geometry.visible_share(name) for name in RANGES}
+        return {**values, **{key: share for key, share in shares.items() if share is not None}}
+
+
+@torch.no_grad()
+def render_path(model: HierStyleModel, cameras: Cameras) -> PathFrames:
+    """Renders a path's frames, each exactly, and finds the world points that the unstylised scene shows there."""
+    frames = PathFrames([], [], [])
+    for index in track(range(len(cameras)), "Measuring path"):
+        camera = cameras[index : index + 1].to(model.device)
+        outputs = exact_outputs(model, camera)
+        rays = camera.generate_rays(camera_indices=0, keep_shape=True)
+        points = rays.origins + outputs["depth_coarse"] * rays.directions  # in the world in every space, NDC too
+        focal, center = (float(camera.fx), float(camera.fy)), (float(camera.cx), float(camera.cy))
+        pinhole = Pinhole(camera.camera_to_worlds[0].cpu(), focal, center)
+        covered = (outputs["accumulation_coarse"] > MIN_COVERAGE).squeeze(-1)
+        frames.stylised.append(outputs["rgb"].clamp(0.0, 1.0).cpu())
+        frames.coarse.append(outputs["rgb_coarse"].clamp(0.0, 1.0).cpu())
+        frames.surfaces.append(Surface(pinhole, points.cpu(), covered.cpu()))
+    return frames

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Dict, List, Optional, Sequence, Tuple
 
 from rich.console import Console
+from rich.table import Column
 from rich.table import Table as RichTable
 
 from sparsestyle_ns.metrics.art_fid import why_left_out
@@ -28,42 +29,32 @@ LABELS: Dict[str, Tuple[str, int]] = {
 COARSE_QUALITY = ("psnr", "ssim", "lpips", "st_lpips", "effective_samples")
 STYLE_AND_CONTENT = ("style_loss", "gram_distance", "art_fid", "content_loss")
 PERCEPTUAL = ("rmse", "ssim", "lpips", "st_lpips")
+CONSISTENCY = [(f"{part}_{kind}", kind, f"{part} ") for part in ("short", "long") for kind in PERCEPTUAL]
+"""Columns of short- and long-range consistency, for `table_of`."""
 
 
 @dataclass
 class Table:
-    """A table of figures.
-
-    Attributes:
-        title: above it.
-        columns: headings of the columns after the first.
-        rows: each row's name and cells; None is an empty one.
-        note: a sentence below it.
-        cited: names of rows whose figures are others', not measured here.
-    """
+    """A table of figures."""
 
     title: str
     columns: Sequence[str]
+    """Headings of the columns after the first."""
     rows: List[Tuple[str, List[Optional[str]]]] = field(default_factory=list)
+    """Each row's name and cells; None is an empty one."""
     note: str = ""
+    """A sentence below it."""
     cited: Tuple[str, ...] = ()
+    """Names of rows whose figures are others', not measured here."""
 
     def print(self) -> None:
         """Prints it."""
-        printed = RichTable(title=self.title, title_justify="left", caption=self.note or None, caption_justify="left")
-        printed.add_column("")
-        for column in self.columns:
-            printed.add_column(column, justify="right")
+        columns = [Column(name, justify="right") for name in self.columns]
+        words = {"title": self.title, "caption": self.note or None}
+        printed = RichTable("", *columns, **words, title_justify="left", caption_justify="left")
         for name, cells in self.rows:
             printed.add_row(name, *(cell or "–" for cell in cells), style="italic dim" if name in self.cited else None)
         Console().print(printed)
-
-
-def written(key: str, value: Optional[float]) -> Optional[str]:
-    """A figure as text, with the decimals of its kind; `key` may be preceded by what it is of (`short_rmse`)."""
-    if value is None:
-        return None
-    return f"{value:.{LABELS[key][1]}f}"
 
 
 def table_of(
@@ -75,32 +66,23 @@ def table_of(
     """A table of some of each row's figures; columns that no row has a figure for are left out.
 
     Args:
-        title: above it.
         columns: of each the figure's key in a row, its kind (a key of `LABELS`), and words before the kind's label.
         rows: of each its name and figures.
-        note: below it.
     """
     shown = [column for column in columns if any(figures.get(column[0]) is not None for _, figures in rows)]
-    return Table(
-        title,
-        [f"{words}{LABELS[kind][0]}" for _, kind, words in shown],
-        [(name, [written(kind, figures.get(key)) for key, kind, _ in shown]) for name, figures in rows],
-        note,
-    )
-
-
-def consistency_columns() -> List[Tuple[str, str, str]]:
-    """Columns of short- and long-range consistency."""
-    return [(f"{part}_{kind}", kind, f"{part} ") for part in ("short", "long") for kind in PERCEPTUAL]
+    table = Table(title, [f"{words}{LABELS[kind][0]}" for _, kind, words in shown], note=note)
+    for name, figures in rows:
+        values = [(figures.get(key), LABELS[kind][1]) for key, kind, _ in shown]
+        table.rows.append((name, [None if value is None else f"{value:.{digits}f}" for value, digits in values]))
+    return table
 
 
 def report_tables(means: Dict[str, float], num_views: int) -> List[Table]:
     """The tables of one run's figures, as `sparsestyle evaluate` prints them."""
     views = f"{num_views} held-out view" + "s" * (num_views > 1)
     prefix = "coarse_" if "coarse_psnr" in means else ""
-    tables = [
-        table_of(f"Coarse field, {views}", [(f"{prefix}{k}", k, "") for k in COARSE_QUALITY], [("coarse", means)])
-    ]
+    quality = [(f"{prefix}{key}", key, "") for key in COARSE_QUALITY]
+    tables = [table_of(f"Coarse field, {views}", quality, [("coarse", means)])]
     if not prefix:
         return tables
     kept = [(key, key, "") for key in (*STYLE_AND_CONTENT, "content_ssim", "baked_psnr")]
@@ -109,7 +91,7 @@ def report_tables(means: Dict[str, float], num_views: int) -> List[Table]:
     tables.append(table_of(f"Style and content, {views}", kept, rows, why_left_out(means)))
     if "short_rmse" in means:
         ceiling = {key[len("ceiling_") :]: value for key, value in means.items() if key.startswith("ceiling_")}
-        columns = [*consistency_columns(), *((f"{part}_visible", "visible", f"{part} ") for part in ("short", "long"))]
+        columns = [*CONSISTENCY, *((f"{part}_visible", "visible", f"{part} ") for part in ("short", "long"))]
         rows = [("stylised", means), ("unstylised (the ceiling)", ceiling)]
         tables.append(table_of("Consistency on the measuring path, frames t and t + 1, t and t + 7", columns, rows))
     return tables

@@ -7,13 +7,18 @@ from typing import Annotated, Literal
 import tyro
 
 from sparsestyle_ns.runs.run_folder import STYLE_METHOD, find_config
-from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.errors import CommandOptions, InputError
 from sparsestyle_ns.utils.files import prepare_output
 
 
 @dataclass
-class ExportOptions:
-    """The options of `sparsestyle export`."""
+class ExportOptions(CommandOptions):
+    """Writes a stylised run as one file that needs no Python, and prints how close it comes to the exact render.
+
+    html is a page that shows the scene in any browser with WebGL2, without server or network: drag to turn, wheel or
+    pinch to zoom. It has at most 30 MB; if it would be larger, the scene gets fewer cells. ply is a cloud of coloured
+    points. mesh is a PLY mesh with coloured vertices, made by Open3D's Poisson reconstruction.
+    """
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder or its config.yml."""
@@ -25,11 +30,7 @@ class ExportOptions:
     """html: cells along a side of the scene's cube. Every browser with WebGL2 can hold 255."""
 
     def check(self) -> None:
-        """Makes sure that there is such a run, and that the file can be written.
-
-        Raises:
-            InputError: an option can't be used.
-        """
+        """Raises an `InputError` if there is no such run, or the file can't be written."""
         if not 32 <= self.resolution <= 1023:
             raise InputError(f"--resolution {self.resolution} isn't between 32 and 1023; 255 suits most scenes.")
         find_config(self.run, STYLE_METHOD)

@@ -9,13 +9,9 @@ from sparsestyle_ns.runs.run_folder import find_config
 
 
 def export_run(options: ExportOptions) -> None:
-    """Writes the file, and prints how close it comes to the exact render.
+    """Writes the file that checked options ask for, and prints how close it comes to the exact render.
 
-    Args:
-        options: checked.
-
-    Raises:
-        InputError: the run has no checkpoint, its scene can't be written so, or Open3D can't be loaded.
+    Raises an `InputError` if the run has no checkpoint, its scene can't be written so, or Open3D can't be loaded.
     """
     if options.format == "mesh":  # found out before the minutes of rendering; other formats work without Open3D
         from sparsestyle_ns.export.mesh import export_mesh

@@ -35,37 +35,23 @@ NORMAL_NEIGHBOURS = 30
 FAR = 4.0
 """Vertices farther from any point than this many times the points' median distance from each other are dropped: the
 reconstruction closes holes with them."""
-MIN_POINTS = 100
 
 
 def export_mesh(scene: StylisedScene, output_path: Path) -> None:
-    """Writes a mesh with coloured vertices as PLY, and prints how well it shows each training view.
-
-    Raises:
-        InputError: there are too few surface points, or the file can't be written.
-    """
+    """Writes a mesh with coloured vertices as PLY, and prints how well it shows each training view."""
     pictures, parts = surfaces(scene)
     mesh = poisson_mesh(joined(parts))
     write_output(output_path, encode_mesh(mesh), "The mesh", "scene.ply")
     print(f"{len(mesh.vertices):,} vertices, {len(mesh.triangles):,} triangles, in nerfstudio's coordinates")
     print("The mesh without light against the exact render:")
-    found = []
-    for index, picture in enumerate(pictures):
-        found.append(likeness(*picture_of_mesh(mesh, scene.cameras[index : index + 1]), picture))
-    print_likeness(scene.names, found)
+    shown = [picture_of_mesh(mesh, scene.cameras[index : index + 1]) for index in range(len(pictures))]
+    print_likeness(scene.names, [likeness(*seen, picture) for seen, picture in zip(shown, pictures, strict=True)])
 
 
 def poisson_mesh(points: Points) -> open3d.geometry.TriangleMesh:
-    """A mesh through surface points, with holes where they are far apart.
-
-    Raises:
-        InputError: there are too few points.
-    """
-    if len(points.positions) < MIN_POINTS:
-        raise InputError(
-            f"The views show only {len(points.positions)} surface points, too few for a mesh; train the coarse field "
-            "longer."
-        )
+    """A mesh through surface points, with holes where they are far apart; `InputError` if there are fewer than 100."""
+    if (count := len(points.positions)) < 100:
+        raise InputError(f"The views show only {count} surface points, too few to mesh; train the coarse field longer.")
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.positions.double().numpy()))
     cloud.colors = open3d.utility.Vector3dVector(points.colors.double().numpy())
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
@@ -76,7 +62,6 @@ def poisson_mesh(points: Points) -> open3d.geometry.TriangleMesh:
     vertices = open3d.geometry.PointCloud(mesh.vertices)
     spacing = float(np.median(cloud.compute_nearest_neighbor_distance()))
     distance = np.asarray(vertices.compute_point_cloud_distance(cloud))
-    density = np.asarray(density)
     mesh.remove_vertices_by_mask((density < np.quantile(density, THIN_SHARE)) | (distance > FAR * spacing))
     return mesh
 

@@ -18,8 +18,7 @@ from sparsestyle_ns.core.spaces import BoxSpace, ForwardFacingSpace, Space
 STEEPEST = 85.0
 """Degrees above or below the horizon that a camera may look from."""
 LEAST_TURN, MOST_TURN = 5.0, 30.0
-"""Degrees that a camera may be turned by in a forward-facing scene, wherever its photos were taken. Beyond lies what no
-photo shows: the fields have arbitrary values there, and the page would differ from the exact render."""
+"""Degrees that a camera may turn in a forward-facing scene; beyond what photos show, fields have arbitrary values."""
 BEYOND_PHOTOS = 1.5
 """How far cameras of a forward-facing scene may turn, as a multiple of the largest angle between two photos."""
 SURVEY_SIDE = 96
@@ -47,11 +46,7 @@ class Orbit:
 
 
 def pinholes(cameras: Cameras, longest: Optional[int] = None) -> Cameras:
-    """The same cameras without distortion, which a page doesn't draw.
-
-    Args:
-        longest: pixels along the longer side, at most; None for all that they have.
-    """
+    """The same cameras without distortion, which a page doesn't draw, with at most `longest` pixels a side."""
     names = ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height")
     plain = Cameras(**{name: getattr(cameras, name) for name in names}, camera_type=CameraType.PERSPECTIVE)
     side = int(max(cameras.width.max(), cameras.height.max()))
@@ -69,10 +64,8 @@ def most_central(cameras: Cameras) -> int:
 def make_orbit(space: Space, cameras: Cameras, opening: int, depth: float) -> Orbit:
     """Where the camera may go from `opening` and still show what the photos have shown.
 
-    Around an object (box) the target is beside its centre, elsewhere at the depth of what the camera sees.
-
-    Args:
-        depth: distance of what the opening camera sees, in world units.
+    Around an object (box) the target is beside its centre, elsewhere at the depth of what the camera sees, `depth`, in
+    world units.
     """
     pose = cameras.camera_to_worlds[opening]
     position, forward = pose[:, 3], -pose[:, 2]
@@ -106,16 +99,12 @@ def turned(orbit: Orbit, cameras: Cameras, yaw: float, pitch: float) -> Cameras:
 
 def rotation(axis: Float[Tensor, "3"], degrees: float) -> Float[Tensor, "3 3"]:
     """Rotation about a unit vector by the right-hand rule."""
-    x, y, z = axis.tolist()
-    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross = torch.linalg.cross(torch.eye(3), axis.expand(3, 3))  # cross @ v is axis × v
     return torch.matrix_exp(math.radians(degrees) * cross)
 
 
 def survey(orbit: Orbit, cameras: Cameras) -> List[Cameras]:
-    """Small cameras that between them see what the page may show: the training views, and turns of the opening one.
-
-    The turns are at most 30 degrees apart, and at least three each way.
-    """
+    """Small cameras that see what the page may show: the photos', and turns of the opening one, at most 30° apart."""
     views = [cameras[index : index + 1] for index in range(len(cameras))]
     ranges = orbit.yaw, orbit.pitch
     angles = [torch.linspace(low, high, max(3, math.ceil((high - low) / 30.0) + 1)) for low, high in ranges]

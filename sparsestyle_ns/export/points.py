@@ -12,6 +12,7 @@ from torch.nn import functional as F
 
 from sparsestyle_ns.evaluation.held_out import MIN_ACCUMULATION
 from sparsestyle_ns.export.stylised_scene import StylisedScene, exact_pictures
+from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.rendering.render import straight_color
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_output
@@ -23,13 +24,7 @@ MAX_DEPTH = 10.0
 
 
 class Points(NamedTuple):
-    """Surface points in the coordinates of nerfstudio's cameras.
-
-    Attributes:
-        positions: in world units.
-        colors: in [0, 1].
-        origins: where the camera that saw a point stood.
-    """
+    """Surface points in nerfstudio's world units, colours in [0, 1], and where the camera that saw a point stood."""
 
     positions: Float[Tensor, "points 3"]
     colors: Float[Tensor, "points 3"]
@@ -37,17 +32,11 @@ class Points(NamedTuple):
 
 
 def export_points(scene: StylisedScene, output_path: Path) -> None:
-    """Writes the training views' surface points as PLY, and prints how well those of the others show each view.
-
-    Raises:
-        InputError: there is no surface point, or the file can't be written.
-    """
+    """Writes the training views' surface points as PLY, and prints how well those of the others show each view."""
     pictures, parts = surfaces(scene)
     points = joined(parts)
     if len(points.positions) == 0:
-        raise InputError(
-            "The views show no surface point, so there is nothing to write; train the coarse field longer."
-        )
+        raise InputError("The views show no surface point, so there is nothing to write; train the coarse field more.")
     write_output(output_path, encode_ply(points), "The points", "scene.ply")
     print(f"{len(points.positions):,} points, in nerfstudio's coordinates")
     if len(parts) > 1:
@@ -57,9 +46,8 @@ def export_points(scene: StylisedScene, output_path: Path) -> None:
 
 def surfaces(scene: StylisedScene) -> Tuple[List[Dict[str, Tensor]], List[Points]]:
     """Full renders of the training views, with the colours of surfaces alone, and the points that each sees."""
-    background = scene.model.background
+    pictures, background = exact_pictures(scene), scene.model.background
     background = None if background is None else background.cpu()
-    pictures = exact_pictures(scene)
     for picture in pictures:
         picture["rgb"] = straight_color(picture["rgb"], picture["accumulation"], background)
     return pictures, [surface_points(scene.cameras[i : i + 1], picture) for i, picture in enumerate(pictures)]
@@ -69,11 +57,7 @@ def surface_points(camera: Cameras, picture: Dict[str, Tensor]) -> Points:
     """The points that one camera sees, one a pixel.
 
     Left out are pixels that see hardly anything, the far background, and those at the edge of something nearer: their
-    mean depth lies where nothing is.
-
-    Args:
-        camera: one pinhole.
-        picture: its render without background: rgb, accumulation and depth, (H, W, channels).
+    mean depth lies where nothing is. `picture` is the camera's render without background: rgb, accumulation and depth.
     """
     bundle = camera.generate_rays(camera_indices=0, keep_shape=True)
     depth, solid = picture["depth"], picture["accumulation"][..., 0] > MIN_ACCUMULATION
@@ -101,20 +85,14 @@ def encode_ply(points: Points) -> bytes:
     rows = np.empty(len(points.positions), dtype=[("position", "<f4", 3), ("color", "u1", 3)])
     rows["position"] = points.positions.numpy()
     rows["color"] = (255.0 * points.colors).round().byte().numpy()
-    properties = [f"property float {name}" for name in "xyz"]
-    properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    kinds = ("float x", "float y", "float z", "uchar red", "uchar green", "uchar blue")
+    properties = [f"property {kind}" for kind in kinds]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties, "end_header", ""]
-    header = "\n".join(lines)
-    return header.encode("ascii") + rows.tobytes()
+    return "\n".join(lines).encode() + rows.tobytes()
 
 
 class Likeness(NamedTuple):
-    """How like a view's exact render a picture of points or of a mesh is.
-
-    Attributes:
-        covered: share of the pixels with a surface, in [0, 1], on which the picture shows anything; 0 without any.
-        psnr: on those pixels, in dB; None where there are none.
-    """
+    """How like an exact render a picture is: share of its surfaces covered, in [0, 1], and PSNR there in dB, if any."""
 
     covered: float
     psnr: Optional[float]
@@ -126,8 +104,7 @@ def likeness(colors: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"], picture
     both = solid & shown
     if not both.any():
         return Likeness(0.0, None)
-    error = (colors[both] - picture["rgb"][both]).square().mean()
-    return Likeness(float(both.sum() / solid.sum()), float(-10.0 * torch.log10(error)))
+    return Likeness(float(both.sum() / solid.sum()), psnr(colors[both], picture["rgb"][both]))
 
 
 def splat(points: Points, camera: Cameras) -> Tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:

@@ -16,14 +16,7 @@ from sparsestyle_ns.utils.progress import track
 
 @dataclass
 class StylisedScene:
-    """A run that is ready to be exported.
-
-    Attributes:
-        title: the scene and the painting.
-        model: in evaluation mode.
-        cameras: the training views, without distortion.
-        names: their photos' file names.
-    """
+    """Scene and painting; the model in evaluation mode; the training views, undistorted, and their photos' names."""
 
     title: str
     model: HierStyleModel
@@ -32,11 +25,7 @@ class StylisedScene:
 
 
 def load_scene(config_path: Path) -> StylisedScene:
-    """Loads a stylised run.
-
-    Raises:
-        InputError: the run has no checkpoint.
-    """
+    """Loads a stylised run; `InputError` if it has no checkpoint."""
     config, pipeline, _ = load_run(config_path)
     dataset = pipeline.datamanager.train_dataset
     painting = config.pipeline.style_image
@@ -46,11 +35,7 @@ def load_scene(config_path: Path) -> StylisedScene:
 
 
 def exact_pictures(scene: StylisedScene, longest: Optional[int] = None) -> List[Dict[str, Tensor]]:
-    """Exact renders of the training views, on the CPU.
-
-    Args:
-        longest: pixels along a side, at most; None for all that the cameras have.
-    """
+    """Exact renders of the training views, on the CPU, made smaller as by `pinholes`."""
     pictures = []
     for index in track(range(len(scene.cameras)), "Exact renders"):
         camera = pinholes(scene.cameras[index : index + 1], longest).to(scene.model.device)

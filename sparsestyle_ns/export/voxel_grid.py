@@ -18,15 +18,7 @@ from torch.nn import functional as F
 from sparsestyle_ns.core.occupancy import Occupancy, march
 from sparsestyle_ns.core.spaces import ForwardFacingSpace, Segments, Space
 from sparsestyle_ns.models.hier_style import RAYS_PER_CALL, HierStyleModel
-from sparsestyle_ns.rendering.baked import (
-    DENSITY_STEP,
-    DENSITY_UNIT,
-    SIDE,
-    BakedVolume,
-    decode,
-    encode,
-    render_baked,
-)
+from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT, SIDE, BakedVolume, decode, encode, render_baked
 from sparsestyle_ns.rendering.mixing import Appearance, Mix, mixed
 from sparsestyle_ns.rendering.render import render_packed
 from sparsestyle_ns.utils.progress import track
@@ -82,17 +74,12 @@ def bake_voxels(model: HierStyleModel, resolution: int, cameras: Sequence[Camera
     """Evaluates a model's fields wherever some cameras may see them, mixed as the model's pictures show them.
 
     These are the cells that aren't empty, in bricks of 8³ that the cameras' rays reach before 99.9% of the light is
-    gone.
-
-    Args:
-        model: in evaluation mode.
-        resolution: cells along a side of the cube.
-        cameras: one camera each. A ray is cast for each pixel, so a brick should be some pixels wide.
+    gone. A ray is cast for each pixel, so a brick should be some pixels wide.
     """
     volume = model.bake(resolution)
     for camera in track(cameras, "Finding what can be seen"):
         for segments in ray_segments(camera.to(model.device), model.space):
-            render_baked(volume, segments, model.marching, model.background)
+            render_baked([volume], segments, model.marching, model.background)
     filled = torch.ones(1, 1, 1, dtype=torch.bool, device=model.device)  # where nothing is known to be empty
     if model.occupancy is not None:
         filled = model.occupancy.occupied
@@ -122,8 +109,7 @@ def last_step_cells(model: HierStyleModel, resolution: int) -> Bool[Tensor, "x y
     """Cells that a ray's last step may lie in, where it goes on to infinity and counts in empty cells too."""
     indices = torch.arange(resolution, device=model.device)
     last = indices >= math.floor((1.0 - 1.0 / model.config.num_steps) * resolution)
-    if not model.space.unbounded:
-        last = torch.zeros_like(last)
+    last = last & model.space.unbounded
     if isinstance(model.space, ForwardFacingSpace):
         return last.expand(resolution, resolution, resolution)
     last = last | last.flip(0)  # infinity is on all sides of the cube
@@ -133,22 +119,18 @@ def last_step_cells(model: HierStyleModel, resolution: int) -> Bool[Tensor, "x y
 @torch.no_grad()
 def picture_of_voxels(voxels: VoxelGrid, model: HierStyleModel, camera: Cameras) -> Float[Tensor, "H W 3"]:
     """What the page shows of one camera, worked out in torch on the CPU."""
-    background = torch.zeros(3) if model.background is None else model.background.cpu()
-    space, num_steps = copy.deepcopy(model.space).cpu(), model.config.num_steps
-    parts = ray_segments(camera, space)
-    colors = [render_voxels(voxels, part, num_steps, space.unbounded, background) for part in parts]
+    colors = [render_voxels(voxels, part, model) for part in ray_segments(camera, copy.deepcopy(model.space).cpu())]
     return torch.cat(colors).view(int(camera.height), int(camera.width), 3)
 
 
 @torch.no_grad()
-def render_voxels(
-    voxels: VoxelGrid, segments: Segments, num_steps: int, unbounded: bool, background: Float[Tensor, "3"]
-) -> Float[Tensor, "rays 3"]:
-    """What the page shows on each ray."""
+def render_voxels(voxels: VoxelGrid, segments: Segments, model: HierStyleModel) -> Float[Tensor, "rays 3"]:
+    """What the page shows on each ray, on the CPU; of the model it takes how it marches, and the background."""
     occupancy = Occupancy(len(voxels.occupied))
     occupancy.occupied = voxels.occupied
-    samples = march(segments, occupancy, num_steps, unbounded)
+    samples = march(segments, occupancy, model.config.num_steps, model.space.unbounded)
     values = voxels.interpolate(samples.positions)
     steps = values[:, 0] - EMPTY
     density = torch.where(steps > ROUNDING, DENSITY_UNIT * torch.expm1(DENSITY_STEP * steps), 0.0)
+    background = None if model.background is None else model.background.cpu()
     return render_packed(samples, len(segments.hit), density, values[:, 1:] / 255.0, background).rgb

@@ -30,20 +30,14 @@ COMPARED_SIDE = 252
 """Pixels along the longer side of the pictures by which a page is measured, at most."""
 MAX_BYTES = 30_000_000
 """Size that a page may have, so that it can be sent by e-mail and opened on a telephone."""
-SHRINK_MARGIN = 0.95
-"""Part of the limit that a page made again, with fewer voxels, aims for."""
 LEAST_RESOLUTION = 32
 """With fewer cells along a side a page shows no scene any more."""
 
 
 def export_page(scene: StylisedScene, output_path: Path, resolution: int) -> None:
-    """Writes the page, and prints its size and its error against the exact render.
+    """Writes the page, and prints its size and its error against the exact render; `InputError` if it doesn't fit.
 
-    Args:
-        resolution: cells along a side of the cube; fewer are taken if the page gets too large.
-
-    Raises:
-        InputError: the scene doesn't fit into a page, or the file can't be written.
+    It has `resolution` cells along a side of the cube, or fewer if it gets too large.
     """
     model, cameras = scene.model, scene.cameras
     exact = exact_pictures(scene, COMPARED_SIDE)
@@ -51,9 +45,7 @@ def export_page(scene: StylisedScene, output_path: Path, resolution: int) -> Non
     orbit = make_orbit(model.space, cameras, opening, median_depth(exact[opening]))
     views = survey(orbit, cameras)
     voxels, page = fit_page(
-        lambda cells: bake_voxels(model, cells, views),
-        lambda voxels: build_page(voxels, scene, orbit),
-        resolution,
+        lambda cells: bake_voxels(model, cells, views), lambda voxels: build_page(voxels, scene, orbit), resolution
     )
     write_output(output_path, page, "The page", "scene.html")
     print(f"{voxels.resolution} cells along a side, {len(page) / 1e6:.1f} MB")
@@ -75,24 +67,17 @@ def median_depth(picture: Dict[str, Tensor]) -> float:
 def fit_page(
     bake: Callable[[int], VoxelGrid], build: Callable[[VoxelGrid], bytes], resolution: int, max_bytes: int = MAX_BYTES
 ) -> Tuple[VoxelGrid, bytes]:
-    """Makes a page that isn't too large, with as many voxels as it may have.
+    """Makes a page of at most `max_bytes`, with as many voxels as it may have; `InputError` if the scene doesn't fit.
 
-    A page that is too large is made again with fewer cells along a side, by the cube root of how much it is too large.
-
-    Args:
-        bake: gives the voxels for a number of cells along a side.
-        build: gives the page for voxels.
-        resolution: cells along a side to begin with.
-
-    Raises:
-        InputError: the scene doesn't fit.
+    A page that is too large is made again with fewer cells along a side, by the cube root of how much it is larger than
+    95% of that.
     """
     while True:
         voxels = bake(resolution)
         page = build(voxels)
         if len(page) <= max_bytes:
             return voxels, page
-        smaller = int(resolution * (SHRINK_MARGIN * max_bytes / len(page)) ** (1.0 / 3.0))
+        smaller = int(resolution * (0.95 * max_bytes / len(page)) ** (1.0 / 3.0))
         if smaller < LEAST_RESOLUTION:
             raise InputError(
                 f"The scene doesn't fit into a page of {max_bytes / 1e6:.0f} MB, even with {resolution} cells along a "
@@ -127,20 +112,13 @@ def build_page(voxels: VoxelGrid, scene: StylisedScene, orbit: Orbit) -> bytes:
 def describe_space(space: Space) -> Dict[str, object]:
     """A space in the words of web_page.js; what it has no use for is 0."""
     kind = {ForwardFacingSpace: "ndc", BoxSpace: "box", ContractedSpace: "contracted"}[type(space)]
-    bounded, forward = kind != "contracted", kind == "ndc"
-    near = space.near
-    if kind == "box":  # in half sides of the cube there, in world units here
-        near = float(near * 0.5 * (space.maximum - space.minimum).amax())
-    return {
-        "kind": kind,
-        "unbounded": space.unbounded,
-        "near": near,
-        "unit": 1.0 if bounded else space.unit,
-        "minimum": space.minimum.tolist() if bounded else [0.0] * 3,
-        "maximum": space.maximum.tolist() if bounded else [0.0] * 3,
-        "focal_over_half_size": space.focal_over_half_size if forward else [0.0] * 2,
-        "depths": [space.first, space.last] if forward else [0.0] * 2,
-    }
+    told = {"kind": kind, "unbounded": space.unbounded, "near": space.near, "unit": getattr(space, "unit", 1.0)}
+    told |= {key: getattr(space, key, torch.zeros(3)).tolist() for key in ("minimum", "maximum")}
+    told["focal_over_half_size"] = getattr(space, "focal_over_half_size", (0.0, 0.0))
+    told["depths"] = [getattr(space, key, 0.0) for key in ("first", "last")]
+    if kind == "box":  # its near plane is in half sides of the cube there, in world units here
+        told["near"] = float(space.near * 0.5 * (space.maximum - space.minimum).amax())
+    return told
 
 
 def describe_camera(camera: Cameras, name: str) -> Dict[str, object]:

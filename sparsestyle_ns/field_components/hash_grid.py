@@ -1,8 +1,7 @@
 """Multi-resolution hash grid ψ(x) (Sec. 3.1; instant-ngp, Sec. 3): what depends on positions, and what learns.
 
-`HashGrid.locate` prepares points; `HashGrid.interpolate` gathers and sums table rows. Points that stay the same from
-step to step are located once. `locate_corners` and `interpolate` are the readable form in torch, which runs anywhere;
-CPU and CUDA have kernels that do the same in one pass.
+`HashGrid.locate` prepares points, once where they stay the same from step to step. `locate_corners` and `interpolate`
+are the readable form in torch, which runs anywhere; CPU and CUDA have kernels that do the same in one pass.
 """
 
 from importlib.util import find_spec
@@ -22,33 +21,26 @@ HASH_PRIMES = (1, 2654435761, 805459861)
 
 
 class Corners(NamedTuple):
-    """The corners of the cells that points lie in.
-
-    Attributes:
-        rows: of the joined table, for the eight corners of each point's cell on each level.
-        weights: trilinear weights of those corners; they sum to 1 on each level.
-    """
+    """The eight corners of the cells that points lie in."""
 
     rows: Int[Tensor, "points levels 8"]
+    """Of the joined table."""
     weights: Float[Tensor, "points levels 8"]
+    """Trilinear; they sum to 1 on each level."""
 
 
 class GridLocation(NamedTuple):
-    """Where points lie in a hash grid.
-
-    Attributes:
-        positions: of the points, in [0, 1].
-        corners: of their cells; None where there are kernels, which work them out faster than they could read them.
-    """
+    """Where points lie in a hash grid."""
 
     positions: Float[Tensor, "points 3"]
+    """In [0, 1]."""
     corners: Optional[Corners]
+    """None where there are kernels, which work them out faster than they could read them."""
 
     @property
     def num_bytes(self) -> int:
         """Memory that the location takes."""
-        parts = (self.positions, *(self.corners or ()))
-        return sum(part.numel() * part.element_size() for part in parts)
+        return sum(part.nbytes for part in (self.positions, *(self.corners or ())))
 
 
 def grid_resolutions(num_levels: int, min_resolution: int, max_resolution: int) -> Tuple[int, ...]:
@@ -96,13 +88,10 @@ def interpolate(table: Float[Tensor, "rows features"], corners: Corners) -> Floa
 
 
 def fused_kernels(device: torch.device) -> Optional[ModuleType]:
-    """The module whose `gather` and `scatter` do the grid's work in one pass on a device; None where there is none.
-
-    Triton comes with torch for CUDA on Linux; where it doesn't, the readable form runs.
-    """
+    """The module whose `gather` and `scatter` do the grid's work in one pass on a device; None where there is none."""
     if device.type == "cpu":
         return hash_grid_kernels
-    if device.type == "cuda" and find_spec("triton") is not None:
+    if device.type == "cuda" and find_spec("triton") is not None:  # it comes with torch for CUDA on Linux
         from sparsestyle_ns.field_components import hash_grid_triton
 
         return hash_grid_triton
@@ -129,13 +118,7 @@ class _Fused(torch.autograd.Function):
 class HashGrid(FieldComponent):
     """ψ(x): `num_levels` grids of features, each hashed into a table.
 
-    Args:
-        num_levels: M.
-        min_resolution: N_min, cells along the cube's side on the first level.
-        max_resolution: N_max, on the last.
-        features_per_level: length of a table row.
-        log2_table_size: log2 of the rows a level has.
-        init_scale: rows start uniform in ± this.
+    Resolutions are cells along the cube's side on the first and the last level; rows start uniform in ± `init_scale`.
     """
 
     def __init__(

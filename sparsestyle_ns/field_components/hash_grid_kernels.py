@@ -81,21 +81,16 @@ def _kernels(features: int) -> Tuple[Callable[..., None], Callable[..., None]]:
 
 
 def gather(
-    table: Float[Tensor, "levels rows features"],
-    positions: Float[Tensor, "points 3"],
-    resolutions: Tuple[int, ...],
+    table: Float[Tensor, "levels rows features"], positions: Float[Tensor, "points 3"], resolutions: Tuple[int, ...]
 ) -> Float[Tensor, "points encoded"]:
     """ψ(x): on each level the weighted sum of the rows of the eight corners around a point.
 
-    Args:
-        table: on the CPU, float32 or float64; rows a level: a power of two.
-        positions: in [0, 1], of the table's type.
-        resolutions: cells along the cube's side, for each level.
+    Positions lie in [0, 1]; they and the table are float32 or float64. A level has a power of two of rows, and its
+    resolution is in cells along the cube's side.
     """
     levels, _, features = table.shape
     encoded = table.new_empty(len(positions), levels, features)
     arrays = positions.contiguous().numpy(), table.detach().numpy(), encoded.numpy()
-    kernel_of_rows = _kernels(features)[0]
     scale = arrays[0].dtype.type
     pieces = even_parts(len(positions), max(1, torch.get_num_threads() // levels))
     parts = [
@@ -103,7 +98,7 @@ def gather(
         for level, resolution in enumerate(resolutions)
         for start, end in pieces
     ]
-    run_on_threads(kernel_of_rows, parts)
+    run_on_threads(_kernels(features)[0], parts)
     return encoded.flatten(1)
 
 
@@ -118,7 +113,6 @@ def scatter(
     values = grad.reshape(len(grad), table_shape[0], table_shape[2]).contiguous().numpy()
     arrays = positions.contiguous().numpy(), table_grad.numpy()
     scale = arrays[0].dtype.type
-    kernel_of_rows = _kernels(table_shape[2])[1]
     parts = [(*arrays, scale(resolution), level, values) for level, resolution in enumerate(resolutions)]
-    run_on_threads(kernel_of_rows, parts)
+    run_on_threads(_kernels(table_shape[2])[1], parts)
     return table_grad

@@ -1,7 +1,6 @@
 """The hash grid on a CUDA device: rows, weights and sums in one kernel in either direction.
 
-The gradients of rows that several points share are added up atomically, in no fixed order: on a GPU the last bits of a
-gradient differ from run to run.
+Gradients of rows that several points share are added up atomically, in no fixed order: their last bits differ by run.
 """
 
 from typing import Tuple
@@ -94,9 +93,7 @@ def _scatter(
 
 
 def gather(
-    table: Float[Tensor, "levels rows features"],
-    positions: Float[Tensor, "points 3"],
-    resolutions: Tuple[int, ...],
+    table: Float[Tensor, "levels rows features"], positions: Float[Tensor, "points 3"], resolutions: Tuple[int, ...]
 ) -> Float[Tensor, "points encoded"]:
     """ψ(x), as `hash_grid_kernels.gather`."""
     encoded = table.new_empty(len(positions), table.shape[0] * table.shape[2])

@@ -1,41 +1,20 @@
-"""What may take the hash grid's place in the residual field: sines and cosines, or nothing (Sec. 4.2, the ablations).
+"""What may take the hash grid's place in the residual field: sines and cosines, or nothing (Sec. 4.2, ablations)."""
 
-Both have the hash grid's two steps, `locate` and `interpolate`, though locating does nothing here.
-"""
-
-from typing import Protocol
+from typing import Union
 
 from jaxtyping import Float
-from nerfstudio.field_components.encodings import FieldComponent
 from torch import Tensor
 
-from sparsestyle_ns.field_components.hash_grid import GridLocation
-from sparsestyle_ns.field_components.positional_encoding import positional_encoding
+from sparsestyle_ns.field_components.hash_grid import GridLocation, HashGrid
+from sparsestyle_ns.field_components.positional_encoding import PositionalEncoding
+from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid
 
 
-class PointEncoding(Protocol):
-    """What the residual field asks of an encoding."""
-
-    def get_out_dim(self) -> int:
-        """Numbers a point."""
-
-    def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
-        """What is needed of points in [0, 1]³, and stays the same while the encoding learns."""
-
-    def interpolate(self, location: GridLocation) -> Float[Tensor, "points encoded"]:
-        """The encoding of located points."""
-
-
-class FrequencyEncoding(FieldComponent):
-    """x and sin(2^k x), cos(2^k x), k = 0 … L − 1, of field coordinates; γ(x) of Eq. 1 with more octaves.
-
-    Args:
-        num_levels: L. Ten octaves have waves of 2π/512, shorter than three cells of the finest hash level.
-    """
+class FrequencyEncoding(PositionalEncoding):
+    """γ(x) of Eq. 1 with more octaves: ten have waves of 2π/512, shorter than three cells of the finest hash level."""
 
     def __init__(self, num_levels: int) -> None:
-        super().__init__(in_dim=3, out_dim=3 * (1 + 2 * num_levels))
-        self.num_levels = num_levels
+        super().__init__(in_dim=3, num_levels=num_levels)
 
     def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
         """The points as they are."""
@@ -43,7 +22,7 @@ class FrequencyEncoding(FieldComponent):
 
     def interpolate(self, location: GridLocation) -> Float[Tensor, "points encoded"]:
         """γ at the points."""
-        return positional_encoding(2.0 * location.positions - 1.0, self.num_levels)
+        return self(2.0 * location.positions - 1.0)
 
 
 class NoEncoding(FrequencyEncoding):
@@ -56,3 +35,7 @@ class NoEncoding(FrequencyEncoding):
     def interpolate(self, location: GridLocation) -> Float[Tensor, "points 0"]:
         """Nothing."""
         return location.positions[:, :0]
+
+
+PointEncoding = Union[HashGrid, TinyCudaGrid, FrequencyEncoding, NoEncoding]
+"""`locate` gives what stays the same of points in [0, 1]³ while it learns, `interpolate` the encoding there."""

@@ -12,9 +12,7 @@ from torch import Tensor
 
 
 def positional_encoding(
-    x: Float[Tensor, "*batch dim"],
-    num_levels: int,
-    level_weights: Optional[Float[Tensor, "levels"]] = None,
+    x: Float[Tensor, "*batch dim"], num_levels: int, level_weights: Optional[Float[Tensor, "levels"]] = None
 ) -> Float[Tensor, "*batch encoded"]:
     """γ(x) of Eq. 1: [x, sin(x), cos(x), sin(2x), cos(2x), …, sin(2^(L−1) x), cos(2^(L−1) x)].
 
@@ -48,12 +46,7 @@ def revealed_levels(fraction: float, num_levels: int) -> Float[Tensor, "levels"]
 
 
 class PositionalEncoding(FieldComponent):
-    """`positional_encoding` as a nerfstudio field component.
-
-    Args:
-        in_dim: number of coordinates.
-        num_levels: L, the number of octaves.
-    """
+    """`positional_encoding` with `num_levels` octaves as a nerfstudio field component."""
 
     def __init__(self, in_dim: int, num_levels: int) -> None:
         super().__init__(in_dim=in_dim, out_dim=in_dim * (1 + 2 * num_levels))

@@ -1,10 +1,9 @@
 """A multilayer perceptron whose backward pass is spared points that hardly matter.
 
-Most of a rendering loss's gradient belongs to few of the samples on its rays: those in empty space and behind surfaces
-have next to none. Each point stays in the backward pass with a probability p in proportion to the size of its gradient
-(1 where that is large), and its gradient is divided by p. The parameters' gradients are then right on average
-("Russian roulette", as in Monte Carlo rendering), at a share of the work: of a step's matrix products two thirds belong
-to the backward pass.
+Samples in empty space and behind surfaces have next to no gradient. Each point stays in the backward pass with a
+probability p in proportion to the size of its gradient (1 where that is large), and its gradient is divided by p. The
+parameters' gradients are then right on average ("Russian roulette", as in Monte Carlo rendering), at a share of the
+work: of a step's matrix products two thirds belong to the backward pass.
 """
 
 from typing import Any, NamedTuple, Optional, Sequence, Tuple
@@ -18,15 +17,12 @@ from sparsestyle_ns.core.precision import at_least_float32
 
 
 class Thinning(NamedTuple):
-    """How many points the backward pass is spared.
-
-    Attributes:
-        threshold: gradients of at least this many times the points' mean always count; 0 spares none.
-        generator: source of random numbers, on the points' device; None is torch's own.
-    """
+    """How many points the backward pass is spared."""
 
     threshold: float
+    """Gradients of at least this many times the points' mean always count; 0 spares none."""
     generator: Optional[torch.Generator] = None
+    """On the points' device."""
 
 
 def thin(

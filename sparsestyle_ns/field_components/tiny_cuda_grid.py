@@ -26,17 +26,12 @@ TOLERANCE = 0.02
 
 
 class Level(NamedTuple):
-    """A grid of tiny-cuda-nn's.
-
-    Attributes:
-        scale: cells along the cube's side, less one; not an integer in general.
-        resolution: corners along the cube's side.
-        first_row: its first row in the joined table.
-        num_rows: how many it has.
-    """
+    """A grid of tiny-cuda-nn's, whose rows in the joined table are one after another."""
 
     scale: float
+    """Cells along the cube's side, less one; not an integer in general."""
     resolution: int
+    """Corners along the cube's side."""
     first_row: int
     num_rows: int
 
@@ -91,11 +86,7 @@ def locate_tiny_cuda_corners(positions: Float[Tensor, "points 3"], levels: Tuple
 
 
 class TinyCudaGrid(FieldComponent):
-    """The hash grid with the arguments of `HashGrid`, and its two steps.
-
-    Args:
-        device: where it will be used; the library's kernels need a GPU.
-    """
+    """The hash grid with the arguments of `HashGrid`, and its two steps; the library's kernels need a GPU."""
 
     def __init__(
         self,

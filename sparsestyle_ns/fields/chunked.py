@@ -13,11 +13,8 @@ as fast as 2^17 at once (2.8 against 4.2 µs a point on two cores); on a GPU it 
 def in_chunks(function: Callable[..., Tuple[Tensor, ...]], *inputs: Tensor) -> Tuple[Tensor, ...]:
     """`function(*inputs)`, a piece of the points at a time where no gradient is asked for.
 
-    With gradients all points are evaluated at once: their hidden layers are kept for the backward pass anyhow.
-
-    Args:
-        function: evaluates points, one a row of each input, on its own; gives one row of each output for each.
-        inputs: [points, …] each.
+    With gradients all points are evaluated at once: their hidden layers are kept for the backward pass anyhow. Inputs
+    and outputs have a row for each point.
     """
     size = POINTS_PER_CHUNK["cpu" if inputs[0].device.type == "cpu" else "cuda"]
     if torch.is_grad_enabled() or len(inputs[0]) <= size:

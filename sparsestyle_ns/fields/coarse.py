@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Dict, List, Literal, Optional, Tuple
+from typing import Dict, Literal, Optional, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -33,14 +33,7 @@ def activate_density(raw: Float[Tensor, "*batch"], activation: DensityActivation
 class CoarseField(Field):
     """(σ_c, e_c, c_c) = F_c(γ(x), d): an MLP on a low-frequency positional encoding (Eq. 1).
 
-    Args:
-        num_levels: octaves of γ(x); the paper has 7.
-        num_layers: hidden layers of the trunk; the paper has 6.
-        layer_width: units in each of them.
-        feature_dim: length of e_c, the geometric feature handed to the residual field and to the colour head.
-        direction_levels: octaves of the view direction's encoding, or None for colour that doesn't depend on it.
-        density_activation: how σ_c is kept positive.
-        density_bias: added before the activation; a negative one starts from thin fog.
+    The arguments are those of `CoarseFieldConfig`; with `direction_levels` None colour doesn't depend on direction.
     """
 
     def __init__(
@@ -67,39 +60,27 @@ class CoarseField(Field):
         )
         self.density_head = nn.Linear(layer_width, 1)
         self.feature_head = nn.Linear(layer_width, feature_dim)
-        self.direction_encoding = (
-            None if direction_levels is None else PositionalEncoding(in_dim=3, num_levels=direction_levels)
-        )
-        direction_dim = 0 if self.direction_encoding is None else self.direction_encoding.get_out_dim()
-        self.color_head = MLP(
-            in_dim=feature_dim + direction_dim,
-            num_layers=2,
-            layer_width=layer_width // 2,
-            out_dim=3,
-        )
+        self.direction_encoding: Optional[PositionalEncoding] = None
+        direction_dim = 0
+        if direction_levels is not None:
+            self.direction_encoding = PositionalEncoding(in_dim=3, num_levels=direction_levels)
+            direction_dim = self.direction_encoding.get_out_dim()
+        self.color_head = MLP(feature_dim + direction_dim, num_layers=2, layer_width=layer_width // 2, out_dim=3)
 
     def density_and_feature(
         self, positions: Float[Tensor, "*batch 3"], thinning: Optional[Thinning] = None
     ) -> Tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch feature"]]:
-        """σ_c and e_c at field coordinates in [−1, 1].
-
-        Args:
-            thinning: spares the backward pass points that hardly matter (`thinned_mlp`); None: none.
-        """
+        """σ_c and e_c at field coordinates in [−1, 1]; `thinning` spares the backward pass points (`thinned_mlp`)."""
         points = positions.reshape(-1, 3)
         if thinning is None:
             density, feature = in_chunks(self._evaluate, points)
         else:
-            raw, feature = thinned_mlp(
-                self.position_encoding(points), self._hidden, (self.density_head, self.feature_head), thinning
-            )
+            hidden = [layer for layer in self.trunk.modules() if isinstance(layer, nn.Linear)]
+            heads = self.density_head, self.feature_head
+            raw, feature = thinned_mlp(self.position_encoding(points), hidden, heads, thinning)
             density = self._activate(raw)
         batch = positions.shape[:-1]
         return density.view(batch), feature.view(*batch, self.feature_dim)
-
-    @property
-    def _hidden(self) -> List[nn.Linear]:
-        return [layer for layer in self.trunk.modules() if isinstance(layer, nn.Linear)]
 
     def _evaluate(self, points: Float[Tensor, "points 3"]) -> Tuple[Tensor, Tensor]:
         hidden = self.trunk(self.position_encoding(points))
@@ -113,9 +94,8 @@ class CoarseField(Field):
     ) -> Float[Tensor, "*batch 3"]:
         """c_c in [0, 1], from e_c and unit view directions."""
         batch = feature.shape[:-1]
-        (color,) = in_chunks(
-            self._evaluate_color, feature.reshape(-1, self.feature_dim), directions.expand(*batch, 3).reshape(-1, 3)
-        )
+        rays = directions.expand(*batch, 3).reshape(-1, 3)
+        (color,) = in_chunks(self._evaluate_color, feature.reshape(-1, self.feature_dim), rays)
         return color.view(*batch, 3)
 
     def _evaluate_color(self, feature: Tensor, directions: Tensor) -> Tuple[Tensor]:
@@ -156,9 +136,5 @@ class CoarseFieldConfig:
     """Added to the density's logit: a field that starts as dense fog is less drawn to the far end of its rays."""
 
     def setup(self, view_dependent: bool) -> CoarseField:
-        """The field.
-
-        Args:
-            view_dependent: whether its colour depends on the view direction.
-        """
+        """The field; `view_dependent` says whether its colour depends on the view direction."""
         return CoarseField(**(vars(self) | ({} if view_dependent else {"direction_levels": None})))

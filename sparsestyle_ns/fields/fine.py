@@ -2,16 +2,41 @@
 
 import copy
 from dataclasses import dataclass
-from typing import Literal, Union
+from typing import Literal, Tuple, Union
 
 import torch
+from jaxtyping import Float
+from torch import Tensor, nn
 
-from sparsestyle_ns.field_components.hash_grid import HashGrid
+from sparsestyle_ns.field_components.hash_grid import GridLocation, HashGrid
 from sparsestyle_ns.field_components.point_encodings import FrequencyEncoding, NoEncoding, PointEncoding
 from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid, has_tiny_cuda_nn
 from sparsestyle_ns.fields.coarse import CoarseField
-from sparsestyle_ns.fields.fine_tuned import FineTunedField
 from sparsestyle_ns.fields.residual import ResidualField
+
+
+class FineTunedField(nn.Module):
+    """(σ, c) of a copy of the coarse field, which learns while the coarse field stays as it is.
+
+    Colour is that of a view straight ahead from everywhere: ARF, too, stylises without view dependence.
+    """
+
+    def __init__(self, field: CoarseField) -> None:
+        super().__init__()
+        self.field = field
+
+    def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
+        """Field coordinates in [−1, 1]³, as they are."""
+        return GridLocation(positions, None)
+
+    def forward(
+        self, location: GridLocation, feature: Float[Tensor, "points feature"], coarse_density: Float[Tensor, "points"]
+    ) -> Tuple[Float[Tensor, "points"], Float[Tensor, "points 3"]]:
+        """σ and c in [0, 1] at located points; what the frozen field has there isn't looked at."""
+        density, own_feature = self.field.density_and_feature(location.positions)
+        ahead = torch.tensor([0.0, 0.0, -1.0], device=location.positions.device)
+        return density, self.field.color(own_feature, ahead.expand_as(location.positions)).float()
+
 
 StylisedField = Union[ResidualField, FineTunedField]
 """Gives σ_f and c_f at located points, from σ_c and e_c there."""
@@ -54,23 +79,11 @@ class FineFieldConfig:
             self.fine_encoding = "tiny-cuda-nn" if is_there else "hash"
 
     def new_field(self, coarse: CoarseField, with_density: bool, device: torch.device) -> StylisedField:
-        """A field as it is before training.
-
-        Args:
-            coarse: the field to stylise; a copy of it starts from its weights.
-            with_density: whether a residual field has a residual density.
-            device: where the field will be used.
-        """
+        """A field as it is before training, to be used on `device`; a copy of `coarse` starts from its weights."""
         if self.stylised_field == "coarse":
             return FineTunedField(copy.deepcopy(coarse).requires_grad_(True))
-        return ResidualField(
-            grid=self._encoding(device),
-            feature_dim=coarse.feature_dim,
-            hidden_layers=self.hidden_layers,
-            layer_width=self.layer_width,
-            density_scale=self.residual_density_scale,
-            with_density=with_density,
-        )
+        sizes = coarse.feature_dim, self.hidden_layers, self.layer_width
+        return ResidualField(self._encoding(device), *sizes, self.residual_density_scale, with_density)
 
     def _encoding(self, device: torch.device) -> PointEncoding:
         if self.fine_encoding == "none":

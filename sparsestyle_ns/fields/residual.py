@@ -37,15 +37,11 @@ def fine_density(residual: Float[Tensor, "*batch"], coarse: Float[Tensor, "*batc
 
 
 class ResidualField(nn.Module):
-    """(σ', c_f) = F_f(ψ(x), e_c): a hash grid and an MLP, no view direction (Eq. 2).
+    """(σ', c_f) = F_f(ψ(x), e_c): an encoding ψ, `grid`, and an MLP, no view direction (Eq. 2).
 
     At the start σ' is 0 everywhere, so that stylising begins from the coarse geometry, and c_f is grey.
 
     Args:
-        grid: ψ, or an encoding in its place.
-        feature_dim: length of e_c.
-        hidden_layers: of the MLP; the paper has 2.
-        layer_width: units in each; the paper has 256.
         density_scale: the MLP's density output is multiplied by this, so that one optimiser step moves σ' by an amount
             that matters beside σ_c (densities are per cube half-side: a surface has some hundreds).
         with_density: whether σ' exists; without it the geometry is the coarse field's.
@@ -81,10 +77,7 @@ class ResidualField(nn.Module):
         return self.grid.locate(0.5 * (positions + 1.0))
 
     def forward(
-        self,
-        location: GridLocation,
-        feature: Float[Tensor, "points feature"],
-        coarse_density: Float[Tensor, "points"],
+        self, location: GridLocation, feature: Float[Tensor, "points feature"], coarse_density: Float[Tensor, "points"]
     ) -> Tuple[Float[Tensor, "points"], Float[Tensor, "points 3"]]:
         """σ_f ≥ 0 (Eq. 3) and c_f in [0, 1] at located points, from e_c and σ_c there."""
         return in_chunks(self._evaluate, self.grid.interpolate(location), feature, coarse_density)

@@ -18,16 +18,12 @@ from sparsestyle_ns.utils.page import Pixels
 from sparsestyle_ns.utils.progress import track
 
 FRAMES_PER_SECOND = 16
-CONSTANT_RATE_FACTOR = 20
+CONSTANT_RATE_FACTOR = "20"
 """x264's measure of quality: 18 can't be told from the original, 23 is its default."""
 
 
 def read_film(path: Path) -> Film:
-    """A film from an MP4 file.
-
-    Raises:
-        InputError: it can't be read or is no MP4.
-    """
+    """A film from an MP4 file; `InputError` if it can't be read or is no MP4."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -41,13 +37,8 @@ def read_film(path: Path) -> Film:
 def make_film(model: HierStyleModel, cameras: Cameras, frames: int, longest_side: int) -> Optional[Film]:
     """Films a scene along the path that its training views give; None where there is only one.
 
-    Frames are baked renders: a film's frames are near to each other, so that most of each is there already.
-
-    Args:
-        model: in evaluation mode.
-        cameras: the training views.
-        frames: how many.
-        longest_side: pixels that a frame's longer side has at most.
+    Frames are baked renders, at most `longest_side` pixels a side: they are near to each other, so that most of each is
+    there already.
     """
     if len(cameras) < 2:
         return None
@@ -56,7 +47,7 @@ def make_film(model: HierStyleModel, cameras: Cameras, frames: int, longest_side
     # H.264 keeps one colour for two by two pixels, so sides have to be even.
     path.width, path.height = path.width - path.width % 2, path.height - path.height % 2
     pictures = []
-    with model.rendering("baked"):
+    with model.display.rendering("baked"):
         for index in track(range(frames), "Filming"):
             outputs = model.get_outputs_for_camera(path[index : index + 1].to(model.device))
             pictures.append(as_pixels(outputs["rgb"].cpu().numpy()))
@@ -66,12 +57,8 @@ def make_film(model: HierStyleModel, cameras: Cameras, frames: int, longest_side
 
 
 def encode_mp4(pictures: Sequence[Pixels]) -> bytes:
-    """Frames as an H.264 film, which every browser shows.
-
-    Args:
-        pictures: of one size, with even sides.
-    """
-    options = ["-crf", str(CONSTANT_RATE_FACTOR), "-preset", "slow", "-movflags", "+faststart"]
+    """Frames of one size, with even sides, as an H.264 film, which every browser shows."""
+    options = ["-crf", CONSTANT_RATE_FACTOR, "-preset", "slow", "-movflags", "+faststart"]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         settings = {"fps": FRAMES_PER_SECOND, "codec": "libx264", "macro_block_size": 2, "output_params": options}

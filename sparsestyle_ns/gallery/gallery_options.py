@@ -7,13 +7,18 @@ from typing import Annotated, Tuple
 import tyro
 
 from sparsestyle_ns.runs.run_folder import STYLE_METHOD, find_config
-from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.errors import CommandOptions, InputError
 from sparsestyle_ns.utils.files import prepare_output
 
 
 @dataclass
-class GalleryOptions:
-    """The options of `sparsestyle gallery`."""
+class GalleryOptions(CommandOptions):
+    """Makes one HTML page of stylised runs that opens without a network.
+
+    It shows the photos, the painting, a slider between the scene before and after, a film, settings, effects, and the
+    figures that `sparsestyle evaluate` has saved in the run's folder. Several runs also get a grid of scenes and
+    paintings.
+    """
 
     runs: Annotated[Tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
     """Stylised runs to show, each by its folder or its config.yml."""
@@ -31,17 +36,12 @@ class GalleryOptions:
     """Measure runs that have no evaluation.json of their newest checkpoint, and save it in their folders."""
 
     def check(self) -> None:
-        """Makes sure that there are such runs, and that the page can be written.
-
-        Raises:
-            InputError: an option can't be used.
-        """
+        """Raises an `InputError` if there are no such runs, or the page can't be written."""
         if not self.runs:
             raise InputError("There is no run to show; name at least one run's folder.")
         if len(self.video) > len(self.runs):
-            raise InputError(
-                f"There are {len(self.video)} videos for {len(self.runs)} runs; give at most one for each run."
-            )
+            given = f"{len(self.video)} videos for {len(self.runs)} runs"
+            raise InputError(f"There are {given}; give at most one for each run.")
         if self.num_views < 1:
             raise InputError(f"--num-views is {self.num_views}; at least one view is needed.")
         if self.frames < 0:

@@ -28,15 +28,7 @@ class Picture:
 
 @dataclass
 class View:
-    """One viewpoint of a run, all pictures of the same size.
-
-    Attributes:
-        name: what kind of view it is and which.
-        stylised: the stylised render.
-        coarse: the render before stylising.
-        photo: the photo taken there.
-        depth: the stylised scene's depth, as a picture.
-    """
+    """One viewpoint of a run: both renders, the photo taken there, and the stylised depth as a picture, of one size."""
 
     name: str
     stylised: Pixels
@@ -47,12 +39,7 @@ class View:
 
 @dataclass
 class Film:
-    """A flight through the scene or a turn about it.
-
-    Attributes:
-        content: an MP4 file's bytes.
-        caption: what it shows, and how it was made.
-    """
+    """An MP4 file's bytes, and what they show."""
 
     content: bytes
     caption: str
@@ -63,15 +50,13 @@ class RunPictures:
     """All that the page shows of one run.
 
     Attributes:
-        name: the scene's name, the section's heading.
+        name: of the scene.
         subtitle: a line on how it was made.
-        photos: the photos it was trained on.
-        views: viewpoints, the first of them shown large; at least one.
-        style_name: the painting's name; on the page, another painting of that name gets a number behind it.
-        style: the style image; None where its file is gone.
+        photos: those it was trained on.
+        views: at least one; the first is shown large.
+        style_name: the painting's; on the page, another painting of that name gets a number behind it.
+        style: the painting; None where its file is gone.
         style_note: said in its place.
-        film: of the stylised scene.
-        tables: what was measured.
         settings: (label, value) of how the run was made.
         effects: lines of the table of effects, the first of them its heading.
     """
@@ -95,12 +80,7 @@ class RunPictures:
 
 
 def gallery_page(runs: Sequence[RunPictures], title: str) -> str:
-    """The whole page as HTML: a section for each run, and a grid of scenes and paintings where there are several.
-
-    Args:
-        runs: what to show, in this order.
-        title: the page's heading, plain text.
-    """
+    """The whole page as HTML: a section for each run, and a grid of scenes and paintings where there are several."""
     runs = with_distinct_paintings(runs)
     scenes: Dict[str, Pixels] = {}
     paintings: Dict[str, Optional[Pixels]] = {}
@@ -118,14 +98,12 @@ def with_distinct_paintings(runs: Sequence[RunPictures]) -> List[RunPictures]:
 
     Paintings are the same if their names and pixels are; a painting whose file is gone is another one.
     """
-    names: Dict[Tuple[str, Optional[Tuple[Tuple[int, ...], bytes]]], str] = {}
+    names: Dict[Tuple[str, object], str] = {}
     distinct = []
     for run in runs:
         pixels = None if run.style is None else (run.style.pixels.shape, run.style.pixels.tobytes())
-        painting = run.style_name, pixels
-        if painting not in names:
-            names[painting] = free_name(run.style_name, names.values())
-        distinct.append(replace(run, style_name=names[painting]))
+        name = names.setdefault((run.style_name, pixels), free_name(run.style_name, names.values()))
+        distinct.append(replace(run, style_name=name))
     return distinct
 
 

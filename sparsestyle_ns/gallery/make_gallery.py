@@ -1,6 +1,5 @@
 """`sparsestyle gallery`: what its page shows of runs is their files, renders, films, and what was measured of them."""
 
-import statistics
 from itertools import zip_longest
 from pathlib import Path
 from typing import Dict, List, Optional, Sequence, Tuple
@@ -14,7 +13,7 @@ from sparsestyle_ns.data.photos import PhotoDataset, at_size
 from sparsestyle_ns.data.view_selection import evenly_spaced
 from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.engine.loading import load_run
-from sparsestyle_ns.evaluation.held_out import HeldOutReport, by_figure, exact_outputs, saved_report
+from sparsestyle_ns.evaluation.held_out import HeldOutReport, exact_outputs, means_of, saved_report
 from sparsestyle_ns.evaluation.tables import Table, report_tables, table_of
 from sparsestyle_ns.gallery.film import as_pixels, make_film, read_film
 from sparsestyle_ns.gallery.gallery_options import GalleryOptions
@@ -32,14 +31,7 @@ LONGEST_SIDE = 512
 
 
 def make_gallery(options: GalleryOptions) -> None:
-    """Writes the page, and says where it is.
-
-    Args:
-        options: checked.
-
-    Raises:
-        InputError: a run or a video can't be used.
-    """
+    """Writes the page, from checked options, and says where it is; `InputError` if a run or a video can't be used."""
     films = list(map(read_film, options.video))  # rendering takes minutes, so what can fail before does
     runs = []
     for run, film in zip_longest(options.runs, films):
@@ -55,22 +47,19 @@ def collect_run(
 ) -> RunPictures:
     """Loads a stylised run, renders what the page shows of it, and finds out what was measured of it.
 
+    Raises an `InputError` if it isn't a finished run of this package, or its photos are gone.
+
     Args:
         run: its folder or its config.yml. The run may have been moved since it was made.
-        film: what to show instead of a film that is made here.
+        film: what to show instead of a film of so many `frames` (0 for none) that is made here.
         num_views: held-out views to render, evenly spaced; fewer where there are fewer.
-        frames: of the film; 0 for none.
-        evaluate: whether to measure the run as `sparsestyle evaluate` does, where its folder has no report of its
-            newest checkpoint; the report is then saved there, if that can be. Without a report, the views that are
-            shown are measured.
-
-    Raises:
-        InputError: it isn't a finished run of this package, or its photos are gone.
+        evaluate: whether to measure the run as `sparsestyle evaluate` does, and save that in its folder, if there is no
+            report of its newest checkpoint. Without a report, the views that are shown are measured.
     """
     config_path = find_config(run, STYLE_METHOD)
     config, pipeline, step = load_run(config_path)
     dataset = pipeline.datamanager.train_dataset
-    originals = _at_full_size(dataset)
+    originals = PhotoDataset(dataset._dataparser_outputs)  # at their files' size, whatever the run was trained on
     photos = [Picture(_photo(originals, index), path.name) for index, path in enumerate(originals.image_filenames)]
     views, measured = _render_views(pipeline, num_views)
     if film is None and frames > 0:
@@ -104,35 +93,26 @@ def _evaluate(folder: Path, config: TrainerConfig, pipeline: HierStylePipeline, 
     return report
 
 
+@torch.no_grad()
 def _render_views(pipeline: HierStylePipeline, num_views: int) -> Tuple[List[View], List[Dict[str, float]]]:
     """Held-out views with their photos, and what the model measures of each."""
     dataset = pipeline.datamanager.eval_dataset
     trained = set(pipeline.datamanager.train_dataset.image_filenames)
-    originals = _at_full_size(dataset)
+    originals = PhotoDataset(dataset._dataparser_outputs)
     views, measured = [], []
     for index in track(evenly_spaced(len(dataset), min(num_views, len(dataset))), "Views"):
         path = dataset.image_filenames[index]
         photo = _photo(originals, index)
-        height, width = photo.shape[:2]
-        camera = at_size(originals.cameras[index : index + 1], *torch.tensor([width, height]).view(2, 1, 1))
-        camera = camera.to(pipeline.device)
+        width_height = torch.tensor(photo.shape[1::-1]).view(2, 1, 1)
+        camera = at_size(originals.cameras[index : index + 1], *width_height).to(pipeline.device)
         camera.distortion_params = dataset.cameras[index : index + 1].distortion_params
-        with torch.no_grad():
-            outputs = exact_outputs(pipeline.model, camera)
-            metrics, _ = pipeline.model.get_image_metrics_and_images(
-                outputs, {"image": torch.from_numpy(photo).to(pipeline.device) / 255.0}
-            )
-        measured.append(metrics)
+        outputs = exact_outputs(pipeline.model, camera)
+        target = {"image": torch.from_numpy(photo).to(pipeline.device) / 255.0}
+        measured.append(pipeline.model.get_image_metrics_and_images(outputs, target)[0])
         arrays = {key: value.cpu().numpy() for key, value in outputs.items()}
-        views.append(
-            View(
-                name=f"{'Training view' if path in trained else 'Held-out view'} {path.name}",
-                stylised=as_pixels(arrays["rgb"]),
-                coarse=as_pixels(arrays["rgb_coarse"]),
-                photo=photo,
-                depth=depth_picture(arrays["depth"], arrays["accumulation"]),
-            )
-        )
+        name = f"{'Training view' if path in trained else 'Held-out view'} {path.name}"
+        renders = as_pixels(arrays["rgb"]), as_pixels(arrays["rgb_coarse"])
+        views.append(View(name, *renders, photo, depth_picture(arrays["depth"], arrays["accumulation"])))
     return views, measured
 
 
@@ -152,11 +132,6 @@ def depth_picture(depth: Float[np.ndarray, "H W 1"], accumulation: Float[np.ndar
     return as_pixels(shade * weight + 0.5 * (1.0 - weight))
 
 
-def _at_full_size(dataset: PhotoDataset) -> PhotoDataset:
-    """The same photos at the size of their files, where the run was trained on smaller ones."""
-    return PhotoDataset(dataset._dataparser_outputs)
-
-
 def _photo(dataset: PhotoDataset, index: int) -> Pixels:
     return thumbnail(dataset.get_image_uint8(index)[..., :3].numpy(), LONGEST_SIDE)
 
@@ -166,15 +141,15 @@ def _style_picture(path: Optional[Path]) -> Optional[Picture]:
     if path is None:
         return None
     try:
-        image = Painting.read(path).pixels
+        pixels = Painting.read(path).pixels
     except InputError:
         return None
-    return Picture(thumbnail(as_pixels(image.permute(1, 2, 0).numpy()), LONGEST_SIDE), path.name)
+    return Picture(thumbnail(as_pixels(pixels.permute(1, 2, 0).numpy()), LONGEST_SIDE), path.name)
 
 
 def _views_table(views: Sequence[Dict[str, float]]) -> Table:
     """Means over the views that are shown of what the model measured of them."""
-    means = {key: statistics.fmean(values) for key, values in by_figure(views).items()}
+    means = means_of(views)
     columns = [(f"coarse_{key}", key, "coarse ") for key in ("psnr", "ssim", "lpips")]
     columns.append(("content_ssim", "content_ssim", "stylised "))
     return table_of(f"Mean of the views above, {len(views)}", columns, [("", means)])

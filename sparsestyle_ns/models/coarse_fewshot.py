@@ -6,12 +6,11 @@ from typing import Any, Dict, List, Optional, Tuple, Type
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
 from sparsestyle_ns.core.occupancy import DensityGrid
-from sparsestyle_ns.core.precision import Precision, autocast
+from sparsestyle_ns.core.precision import autocast
 from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.schedules import ramp
 from sparsestyle_ns.core.spaces import Segments
@@ -19,24 +18,19 @@ from sparsestyle_ns.core.volrend import distortion, effective_samples
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.field_components.positional_encoding import revealed_levels
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
-from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.losses.coarse import matched_depth_loss, near_density, reconstruction_loss
 from sparsestyle_ns.metrics.image import image_metrics, psnr_of_error
-from sparsestyle_ns.models.scene_model import SceneModel
+from sparsestyle_ns.models.scene_model import SceneModel, SceneModelConfig
 from sparsestyle_ns.rendering.render import DenseRender, render_coarse, seen_behind, surface_distance
 from sparsestyle_ns.utils.distributed import gather_rays, num_processes, shard_rays
 from sparsestyle_ns.utils.errors import InputError
 
 
 @dataclass
-class CoarseFewShotModelConfig(ModelConfig):
+class CoarseFewShotModelConfig(SceneModelConfig):
     """Settings of stage 1."""
 
     _target: Type = field(default_factory=lambda: CoarseFewShotModel)
-    enable_collider: bool = False
-    """Unused: the space of the scene decides where rays start and end."""
-    coarse_field: CoarseFieldConfig = field(default_factory=CoarseFieldConfig)
-    """The coarse field."""
     num_samples: int = 24
     """Samples a ray in training."""
     num_eval_samples: int = 64
@@ -64,11 +58,6 @@ class CoarseFewShotModelConfig(ModelConfig):
     """Part of a ray, from its start, that counts as close for the occlusion loss."""
     frequency_reveal: float = 0.0
     """Share of the iterations in which the encoding's octaves are revealed one by one (FreeNeRF); 0 is off."""
-    precision: Precision = "auto"
-    """Number format of matrix products: auto is bfloat16 where the device multiplies it, else float32; tf32 is for
-    GPUs."""
-    eval_num_rays_per_chunk: int = 8192
-    """Rays rendered at once outside of training."""
     seed: int = 42
     """Seed of the jitter of samples; a step's jitter depends on it and the step alone."""
 
@@ -81,8 +70,7 @@ class CoarseFewShotModel(SceneModel):
     def populate_modules(self) -> None:
         """Builds the field, and the grid that guides samples."""
         super().populate_modules()
-        if not 0.0 < self.config.even_share <= 1.0:
-            share = self.config.even_share
+        if not 0.0 < (share := self.config.even_share) <= 1.0:
             raise InputError(f"--pipeline.model.even-share is {share}; give a number above 0 and up to 1.")
         self.field = self.config.coarse_field.setup(self.effects.on("view_color"))
         self.build_grid(self.effects)
@@ -104,28 +92,17 @@ class CoarseFewShotModel(SceneModel):
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> List[TrainingCallback]:
         """Tells the model the step before each iteration."""
-        trainer = training_callback_attributes.trainer
-        if trainer is not None:
-            self.num_steps = trainer.config.max_num_iterations
-        return [
-            TrainingCallback(where_to_run=[TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], func=self.update_to_step)
-        ]
+        if training_callback_attributes.trainer is not None:
+            self.num_steps = training_callback_attributes.trainer.config.max_num_iterations
+        return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self.update_to_step)]
 
     def update_to_step(self, step: int) -> None:
         """Sets what depends on the iteration: the jitter and the octaves that are revealed."""
         self.step = step
-        levels = self.config.coarse_field.num_levels
-        reveal = self.config.frequency_reveal * self.num_steps
-        self.field.position_encoding.level_weights = (
-            revealed_levels(step / reveal, levels) if self.training and step < reveal else None
-        )
-
-    def _distortion_share(self) -> float:
-        """How much of its weight the distortion loss has in this iteration, in [0, 1]."""
-        return ramp(self.step / self.num_steps, self.config.distortion_start, self.config.distortion_ramp)
-
-    def _generator(self) -> torch.Generator:
-        return torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + self.step)
+        reveal, levels = self.config.frequency_reveal * self.num_steps, None
+        if self.training and step < reveal:
+            levels = revealed_levels(step / reveal, self.config.coarse_field.num_levels)
+        self.field.position_encoding.level_weights = levels
 
     def place_samples(self, segments: Segments, num_samples: int, generator: Optional[torch.Generator]) -> Tensor:
         """Borders of samples on rays: where the grid remembers density, or evenly without one."""
@@ -139,20 +116,13 @@ class CoarseFewShotModel(SceneModel):
         self, segments: Segments, directions: Tensor, edges: Tensor, thinning: Optional[Thinning] = None
     ) -> DenseRender:
         """Renders rays with the samples that `edges` bound."""
+        background = self.background
         with autocast(self.device, self.config.precision):
-            return render_coarse(
-                self.field, segments, directions, edges, self.space.unbounded, self.background, thinning
-            )
-
-    def render_rays(self, ray_bundle: RayBundle, num_samples: int) -> Tuple[DenseRender, Segments]:
-        """Renders rays with this many samples, placed without jitter; also returns the rays' segments."""
-        segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
-        edges = self.place_samples(segments, num_samples, None)
-        return self.render(segments, ray_bundle.directions, edges), segments
+            return render_coarse(self.field, segments, directions, edges, self.space.unbounded, background, thinning)
 
     def render_batch(self, segments: Segments, origins: Tensor, directions: Tensor) -> Tuple[DenseRender, Tensor]:
         """Renders the rays of a training step, each process its share; also returns the samples' borders."""
-        generator = self._generator()
+        generator = torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + self.step)
         edges = self.place_samples(segments, self.config.num_samples, generator)
         thinning = Thinning(self.config.thinning, generator) if self.config.thinning > 0 else None
         if num_processes() == 1:
@@ -163,11 +133,12 @@ class CoarseFewShotModel(SceneModel):
 
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
         """`rgb`, `accumulation`, and `depth` in world units; in training also what the losses need."""
+        segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
         if not self.training:
-            render, segments = self.render_rays(ray_bundle, self.config.num_eval_samples)
+            edges = self.place_samples(segments, self.config.num_eval_samples, None)
+            render = self.render(segments, ray_bundle.directions, edges)
             depth = surface_distance(segments, render.s)
             return {"rgb": render.rgb, "accumulation": render.accumulation, "depth": depth}
-        segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
         render, edges = self.render_batch(segments, ray_bundle.origins, ray_bundle.directions)
         if self.grid is not None:
             self.grid.remember(render.positions, render.density)
@@ -206,17 +177,15 @@ class CoarseFewShotModel(SceneModel):
             return losses
         config = self.config
         if config.distortion_weight > 0:
-            weight = config.distortion_weight * self._distortion_share()
+            grown = ramp(self.step / self.num_steps, config.distortion_start, config.distortion_ramp)
+            weight = config.distortion_weight * grown
             losses["distortion_loss"] = weight * distortion(outputs["weights"], outputs["edges"]).mean()
         if "matched_s" in outputs:
-            rows = slice(len(photo), None)
-            losses["matched_depth_loss"] = config.matched_depth_weight * matched_depth_loss(
-                outputs["weights"][rows], outputs["edges"][rows], outputs["matched_s"][rows]
-            )
+            matched = (outputs[name][len(photo) :] for name in ("weights", "edges", "matched_s"))
+            losses["matched_depth_loss"] = config.matched_depth_weight * matched_depth_loss(*matched)
         if config.occlusion_weight > 0:
-            losses["occlusion_loss"] = config.occlusion_weight * near_density(
-                outputs["density"], outputs["edges"], config.occlusion_range
-            )
+            near = near_density(outputs["density"], outputs["edges"], config.occlusion_range)
+            losses["occlusion_loss"] = config.occlusion_weight * near
         return losses
 
     def get_image_metrics_and_images(

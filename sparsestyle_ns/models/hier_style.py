@@ -1,39 +1,25 @@
 """`hier-style`: the coarse field, frozen, and the residual field that stylises it (stage 2)."""
 
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional, Tuple, Type
 
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
 from sparsestyle_ns.core.occupancy import Occupancy, march
-from sparsestyle_ns.core.precision import Precision, autocast
-from sparsestyle_ns.core.spaces import Segments
-from sparsestyle_ns.fields.coarse import CoarseFieldConfig
-from sparsestyle_ns.fields.fine import FineFieldConfig, StylisedField
-from sparsestyle_ns.fields.fine_tuned import FineTunedField
+from sparsestyle_ns.core.precision import autocast
+from sparsestyle_ns.fields.fine import FineFieldConfig, FineTunedField, StylisedField
 from sparsestyle_ns.metrics.image import image_metrics
-from sparsestyle_ns.models.scene_model import SceneModel
-from sparsestyle_ns.rendering.baked import BakedVolume, shade_of
-from sparsestyle_ns.rendering.baked_cache import BakedCache
+from sparsestyle_ns.models.scene_model import SceneModel, SceneModelConfig
+from sparsestyle_ns.rendering import render
+from sparsestyle_ns.rendering.baked import BakedCache, BakedVolume, shade_of
 from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
 from sparsestyle_ns.rendering.look import Display, Look, RenderMode
-from sparsestyle_ns.rendering.mixing import STYLISED, Mix
-from sparsestyle_ns.rendering.render import (
-    POINTS_PER_CALL,
-    FrozenSamples,
-    PackedRender,
-    freeze_samples,
-    render_mixed,
-    render_stylised,
-    straight_color,
-    surface_distance,
-)
+from sparsestyle_ns.rendering.mixing import Mix
+from sparsestyle_ns.rendering.render import FrozenSamples, PackedRender, straight_color, surface_distance
 from sparsestyle_ns.rendering.visible_samples import Marching
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.numba_kernels import untraced
@@ -44,14 +30,10 @@ RAYS_PER_CALL = 1 << 13
 
 
 @dataclass
-class HierStyleModelConfig(FineFieldConfig, ModelConfig):
+class HierStyleModelConfig(FineFieldConfig, SceneModelConfig):
     """Settings of both fields and of how they are rendered."""
 
     _target: Type = field(default_factory=lambda: HierStyleModel)
-    enable_collider: bool = False
-    """Unused: the space of the scene decides where rays start and end."""
-    coarse_field: CoarseFieldConfig = field(default_factory=CoarseFieldConfig)
-    """The coarse field; taken over from the coarse run."""
     num_steps: int = 128
     """Even steps along a ray; those in empty cells are skipped."""
     occupancy_resolution: int = 128
@@ -60,9 +42,6 @@ class HierStyleModelConfig(FineFieldConfig, ModelConfig):
     """Opacity over a cell's side, in (0, 1), below which the coarse field counts as empty there."""
     min_transmittance: float = 1e-3
     """Share of light left, in (0, 1), below which samples farther along the ray are dropped."""
-    precision: Precision = "auto"
-    """Number format of matrix products: auto is bfloat16 where the device multiplies it, else float32; tf32 is for
-    GPUs."""
     render_mode: RenderMode = "exact"
     """How pictures are made outside of training. exact evaluates the fields at every sample. baked reads them from a
     voxel grid that is filled where rays pass: the first picture of a place takes as long as an exact one, later ones a
@@ -76,8 +55,6 @@ class HierStyleModelConfig(FineFieldConfig, ModelConfig):
     bake_resolution: int = 256
     """Cells along the cube's side in baked rendering. Each brick of 8³ that rays have been to takes 4 KiB: at most
     147 MB with 256, 482 MB with 384."""
-    eval_num_rays_per_chunk: int = 8192
-    """Rays rendered at once outside of training."""
 
 
 class HierStyleModel(SceneModel):
@@ -95,19 +72,15 @@ class HierStyleModel(SceneModel):
         self.occupancy = Occupancy(config.occupancy_resolution) if effects.on("empty_space") else None
         if self.exposure is not None:
             self.exposure.requires_grad_(False)
-        self.display = Display(Look(config.render_mode, self._configured_mix()))
+        for name in ("strength", "geometry_strength"):
+            if not 0.0 <= (value := getattr(config, name)) <= 1.0:
+                flag = name.replace("_", "-")
+                raise InputError(f"--pipeline.model.{flag} is {value}; give a number from 0 to 1.")
+        self.display = Display(Look(config.render_mode, Mix(config.strength, config.geometry_strength)))
         self.baked = BakedCache(
             lambda style: self.bake(config.bake_resolution, style),
             lambda: [part for part in (self.field, self.space, self.occupancy) if part is not None],
         )
-
-    def _configured_mix(self) -> Mix:
-        config = self.config
-        for name in ("strength", "geometry_strength"):
-            if not 0.0 <= getattr(config, name) <= 1.0:
-                flag = name.replace("_", "-")
-                raise InputError(f"--pipeline.model.{flag} is {getattr(config, name)}; give a number from 0 to 1.")
-        return Mix(config.strength, config.geometry_strength)
 
     def new_style(self) -> StylisedField:
         """A field to be stylised, as it is before training, on the coarse field's device."""
@@ -115,7 +88,6 @@ class HierStyleModel(SceneModel):
         return new.to(next(self.field.parameters()).device)
 
     def _built_for(self) -> torch.device:
-        """The device that the pipeline names when it has the model made."""
         return torch.device(self.kwargs.get("device", "cpu"))
 
     @property
@@ -130,16 +102,11 @@ class HierStyleModel(SceneModel):
 
     @torch.no_grad()
     def adopt_coarse(self, state: Dict[str, Tensor]) -> None:
-        """Takes over a coarse model's field, space and exposures, and finds out which cells are empty.
-
-        Args:
-            state: the state of a `CoarseFewShotModel` with the same settings of the field and of the space.
-        """
+        """Takes over the state of a `CoarseFewShotModel` with these settings, and finds out which cells are empty."""
         for name in ("field", "space", "exposure"):
-            if getattr(self, name) is None:
-                continue
-            part = {key[len(name) + 1 :]: value for key, value in state.items() if key.startswith(name + ".")}
-            getattr(self, name).load_state_dict(part, strict=True)
+            if getattr(self, name) is not None:
+                part = {key[len(name) + 1 :]: value for key, value in state.items() if key.startswith(name + ".")}
+                getattr(self, name).load_state_dict(part, strict=True)
         self.field.to(self.device)
         if isinstance(self.residual, FineTunedField):
             self.residual.field.load_state_dict(self.field.state_dict())
@@ -153,12 +120,13 @@ class HierStyleModel(SceneModel):
                 finding.advance(len(points))
                 return values
 
-            self.occupancy.measure(density, self.config.min_alpha, POINTS_PER_CALL)
+            self.occupancy.measure(density, self.config.min_alpha, render.POINTS_PER_CALL)
 
     def freeze(self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]) -> FrozenSamples:
-        """The samples of rays that can show, with the coarse field evaluated there."""
+        """`freeze_samples` of rays for this model's own style."""
         with autocast(self.device, self.config.precision):
-            return freeze_samples(self.field, self.residual, self.space.segments(origins, directions), self.marching)
+            segments = self.space.segments(origins, directions)
+            return render.freeze_samples(self.field, self.residual, segments, self.marching)
 
     def freeze_view(
         self,
@@ -168,50 +136,25 @@ class HierStyleModel(SceneModel):
         keep_bytes: float,
     ) -> FrozenView:
         """A view for whole-image steps, in chunks of at most `samples_per_chunk` samples (see `FrozenView`)."""
-        parts = zip(origins.split(RAYS_PER_CALL), directions.split(RAYS_PER_CALL), strict=True)
-        counts = torch.cat([self._count_samples(*rays) for rays in parts])
-        runs = split_by_samples(counts, samples_per_chunk)
+        counts = []
+        for part in zip(origins.split(RAYS_PER_CALL), directions.split(RAYS_PER_CALL), strict=True):
+            segments = self.space.segments(*part)
+            samples = march(segments, self.occupancy, self.config.num_steps, self.space.unbounded)
+            counts.append(torch.bincount(samples.ray_indices, minlength=len(segments.hit)))
+        runs = split_by_samples(torch.cat(counts), samples_per_chunk)
         return FrozenView(runs, lambda run: self.freeze(origins[run], directions[run]), keep_bytes)
-
-    def _count_samples(self, origins: Tensor, directions: Tensor) -> Tensor:
-        segments = self.space.segments(origins, directions)
-        samples = march(segments, self.occupancy, self.config.num_steps, self.space.unbounded)
-        return torch.bincount(samples.ray_indices, minlength=len(origins))
 
     def stylised(
         self, frozen: FrozenSamples, coarse_geometry: bool = False, style: Optional[StylisedField] = None
     ) -> PackedRender:
-        """Renders σ_f, or with `coarse_geometry` σ_c, and c_f at frozen samples; differentiable.
-
-        Args:
-            style: the stylised field; None: the model's own.
-        """
+        """`render_stylised` of a style, by default the model's own."""
         with autocast(self.device, self.config.precision):
-            return render_stylised(style or self.residual, frozen, self.background, coarse_geometry)
+            return render.render_stylised(style or self.residual, frozen, self.background, coarse_geometry)
 
     def bake(self, resolution: int, style: Optional[StylisedField] = None) -> BakedVolume:
-        """The fields, to be kept in a voxel grid; nothing is evaluated before rays are rendered.
-
-        Args:
-            resolution: cells along a side of the cube.
-            style: the stylised field; None: the model's own.
-        """
+        """The fields with a style, by default the model's own, in a voxel grid that is filled as rays are rendered."""
         shade = shade_of(self.field, style or self.residual, self.space, self.config.precision)
         return BakedVolume(shade, resolution, self.device)
-
-    def render_baked(
-        self, segments: Segments, styles: Tuple[StylisedField, ...], mix: Mix = STYLISED
-    ) -> Tuple[PackedRender, PackedRender]:
-        """Renders from voxels a mixture of the fields, and the coarse field; fills in the voxels that are missing."""
-        return self.baked.render(styles, segments, self.marching, self.background, mix)
-
-    def render_exact(
-        self, ray_bundle: RayBundle, styles: Tuple[StylisedField, ...], mix: Mix
-    ) -> Tuple[PackedRender, PackedRender]:
-        """Renders a mixture of the fields, and the coarse field, by evaluating them at every sample."""
-        frozen = self.freeze(ray_bundle.origins, ray_bundle.directions)
-        with autocast(self.device, self.config.precision):
-            return render_mixed(self.field, styles, frozen, ray_bundle.directions, self.background, mix)
 
     @untraced
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
@@ -220,9 +163,11 @@ class HierStyleModel(SceneModel):
         look = self.display.look
         styles = look.styles or (self.residual,)
         if look.mode == "baked" and not self.training:
-            fine, coarse = self.render_baked(segments, styles, look.mix)
+            fine, coarse = self.baked.render(styles, segments, self.marching, self.background, look.mix)
         else:
-            fine, coarse = self.render_exact(ray_bundle, styles, look.mix)
+            frozen, directions = self.freeze(ray_bundle.origins, ray_bundle.directions), ray_bundle.directions
+            with autocast(self.device, self.config.precision):
+                fine, coarse = render.render_mixed(self.field, styles, frozen, directions, self.background, look.mix)
         return {
             "rgb": fine.rgb,
             "rgb_coarse": coarse.rgb,
@@ -232,15 +177,8 @@ class HierStyleModel(SceneModel):
             "depth_coarse": surface_distance(segments, coarse.s),
         }
 
-    def rendering(self, mode: RenderMode) -> AbstractContextManager[None]:
-        """Within it, pictures are made in this mode, except those for the viewer (see `Display`)."""
-        return self.display.rendering(mode)
-
     def get_rgba_image(self, outputs: Dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """Colour without background, and opacity, for `ns-export tsdf` and ns-render's output rgba.
-
-        Opacity is the stylised geometry's, for `rgb_coarse` too.
-        """
+        """Colour without background, and the stylised geometry's opacity, for `ns-export tsdf` and ns-render's rgba."""
         color = straight_color(outputs[output_name], outputs["accumulation"], self.background)
         return torch.cat([color, outputs["accumulation"]], dim=-1)
 

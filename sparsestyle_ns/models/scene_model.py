@@ -1,32 +1,45 @@
 """What the models of both stages have in common: they are built for what was decided about a scene."""
 
+from dataclasses import dataclass, field
 from typing import Any, Optional
 
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.base_model import Model, ModelConfig
 
+from sparsestyle_ns.core.precision import Precision
 from sparsestyle_ns.data.scene_info import NDC
 from sparsestyle_ns.effects.background import background_color
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.layouts import build_space
 from sparsestyle_ns.effects.matched_colors import build_exposure
+from sparsestyle_ns.fields.coarse import CoarseFieldConfig
+
+
+@dataclass
+class SceneModelConfig(ModelConfig):
+    """Settings that both stages have."""
+
+    enable_collider: bool = False
+    """Unused: the space of the scene decides where rays start and end."""
+    coarse_field: CoarseFieldConfig = field(default_factory=CoarseFieldConfig)
+    """The coarse field; stage 2 takes it over from the coarse run."""
+    precision: Precision = "auto"
+    """Number format of matrix products: auto is bfloat16 where the device multiplies it, else float32; tf32 is for
+    GPUs."""
+    eval_num_rays_per_chunk: int = 8192
+    """Rays rendered at once outside of training."""
 
 
 class SceneModel(Model):
     """A model of a scene, with its space, its background colour and its photos' exposures.
 
-    Args:
-        config: the model's settings.
-        scene_box: the dataparser's; in NDC if there is `ndc`, else in the world.
-        num_train_data: training photos.
-        effects: what is simulated.
-        ndc: the dataparser's map to NDC, without which space isn't laid out so.
-        kwargs: for nerfstudio's model, among them the `device` that it will be moved to.
+    `scene_box` is in NDC where there is `ndc`, the dataparser's map to it, else in the world; among `kwargs` is the
+    `device` that the model will be moved to.
     """
 
     def __init__(
         self,
-        config: ModelConfig,
+        config: SceneModelConfig,
         scene_box: SceneBox,
         num_train_data: int,
         effects: Decisions,

@@ -45,19 +45,15 @@ class CheckedPipelineConfig(VanillaPipelineConfig):
     """Makes what the viewer shows of a run beside nerfstudio's own controls; None: nothing."""
 
     def load_backbone(self, device: torch.device) -> Backbone:
-        """The feature network of these settings.
-
-        Raises:
-            InputError: there are no weights for it, or they can't be read.
-        """
+        """The feature network of these settings; InputError where it has no weights that can be read."""
         return load_backbone(self.backbone, self.vgg_weights).to(device)
 
 
 class CheckedPipeline(VanillaPipeline):
     """A pipeline that ends with a clear sentence on bad input, and never loads a checkpoint in part.
 
-    It decides which of the scene's effects are simulated, unless its config says so already, and tells the data manager
-    and the model. `config.decided` is the one thing that it writes into its config: a saved run is opened by it.
+    It decides which of the scene's effects are simulated, unless its config says so already, and writes that into its
+    config as `decided`, by which a saved run is opened.
     """
 
     config: CheckedPipelineConfig
@@ -75,9 +71,7 @@ class CheckedPipeline(VanillaPipeline):
     ) -> None:
         Pipeline.__init__(self)  # VanillaPipeline's would build the model before anything is decided
         self.config, self.test_mode = config, test_mode
-        self.world_size = (
-            1  # several processes share the rays themselves (`utils.distributed`), the model isn't wrapped
-        )
+        self.world_size = 1  # several processes share the rays themselves (`utils.distributed`); no model is wrapped
         self.datamanager = config.datamanager.setup(device=device, test_mode=test_mode, local_rank=local_rank)
         self.datamanager.to(device)
         if config.decided is None:
@@ -104,15 +98,10 @@ class CheckedPipeline(VanillaPipeline):
 
     def announce(self, backbone: Backbone) -> None:
         """Says which feature network is in use, and where its weights came from."""
-        description = backbone.description
-        CONSOLE.print(f"Features: {description.name}, {description.source}", soft_wrap=True)
+        CONSOLE.print(f"Features: {backbone.description.name}, {backbone.description.source}", soft_wrap=True)
 
     def style_targets(self, style_image: Optional[Path] = None) -> Optional[StyleTargets]:
-        """The painting to measure against, where the method has one and it is still there.
-
-        Args:
-            style_image: another one than that of the run.
-        """
+        """The painting to measure against, the run's own or another, where the method has one and it is still there."""
         return None
 
     def held_out_report(
@@ -131,16 +120,13 @@ class CheckedPipeline(VanillaPipeline):
         self.eval()
         report = self.held_out_report(picture_folder=output_path)
         self.train()
-        return {**report.means, **(report.deviations() if get_std else {}), **report.speed()}
+        return {**report.means, **(report.deviations() if get_std else {}), **report.speed}
 
     @exit_on_input_error
     def load_pipeline(self, loaded_state: Dict[str, Any], step: int) -> None:
-        """Loads a checkpoint's state.
+        """Loads a checkpoint's state; InputError where its names or shapes aren't this pipeline's.
 
-        nerfstudio would try again without strictness on a mismatch and so lose weights in silence.
-
-        Raises:
-            InputError: the checkpoint's names or shapes are not those of this pipeline.
+        nerfstudio would try again without strictness and so lose weights in silence.
         """
         expected = self.state_dict()
         found = {key.removeprefix("module."): value for key, value in loaded_state.items()}

@@ -1,19 +1,28 @@
-"""The pipeline of `coarse-fewshot`: batches of rays of a few photos."""
+"""The pipeline of `coarse-fewshot`: batches of rays of a few photos, and views that nobody photographed."""
 
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional, Tuple, Type
 
 import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from sparsestyle_ns.core.camera_paths import unseen_places
 from sparsestyle_ns.effects.registry import decide_again
+from sparsestyle_ns.losses.coarse import pooled_features, semantic_loss
+from sparsestyle_ns.losses.stylization import fit_side
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel, CoarseFewShotModelConfig
 from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
-from sparsestyle_ns.pipelines.unseen_views import UnseenViews
+from sparsestyle_ns.pipelines.datamanager import bundle_rays
+from sparsestyle_ns.style.backbone import Backbone
 from sparsestyle_ns.utils.errors import InputError
+
+NUM_PLACES = 240
+"""Places that a view is drawn from, at least."""
 
 
 @dataclass
@@ -32,6 +41,46 @@ class CoarseFewShotPipelineConfig(CheckedPipelineConfig):
     """Longer side, in pixels, of the views rendered for it; all their rays are in memory at once."""
 
 
+class UnseenViews:
+    """The semantic loss of views drawn at random from `unseen_places`, each against a photo drawn at random.
+
+    DietNeRF (Jain et al. 2021) embeds pictures by CLIP, which knows things; here VGG-16's third block knows their
+    textures and parts. No module: a checkpoint doesn't hold the network.
+
+    Args:
+        cameras: of the photos, two or more.
+        photos: what they saw, in [0, 1], on the network's device.
+        side: longer side, in pixels, at which views are rendered, and the network sees them and the photos.
+    """
+
+    def __init__(self, backbone: Backbone, cameras: Cameras, photos: List[Float[Tensor, "H W 3"]], side: int) -> None:
+        self.backbone, self.side = backbone, side
+        places = unseen_places(cameras, NUM_PLACES)
+        longest = max(int(places.width[0]), int(places.height[0]))
+        places.rescale_output_resolution(side / longest, scale_rounding_mode="ceil")
+        self.places = places.to(photos[0].device)
+        with torch.no_grad():
+            self.photos = torch.cat([self.embedding(photo) for photo in photos])
+
+    def embedding(self, picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 C"]:
+        """What the network says that a picture shows."""
+        image = fit_side(picture.permute(2, 0, 1)[None], self.side, self.backbone.smallest_side)
+        return pooled_features(self.backbone(image))
+
+    def loss(self, model: CoarseFewShotModel, generator: torch.Generator) -> Float[Tensor, ""]:
+        """The loss of one view, rendered as training rays are, at the exposure of the photo that it is held against.
+
+        View and photo are drawn by `generator`, on the CPU.
+        """
+        place = int(torch.randint(len(self.places), (), generator=generator))
+        photo = int(torch.randint(len(self.photos), (), generator=generator))
+        rays = self.places[place : place + 1].generate_rays(camera_indices=0, keep_shape=True)
+        origins = rays.origins.reshape(-1, 3)
+        photos = torch.full_like(origins[:, 0], photo, dtype=torch.long)
+        view = model(bundle_rays(origins, rays.directions.reshape(-1, 3), photos, {}))["rgb"]
+        return semantic_loss(self.embedding(view.view(rays.origins.shape)), self.photos[photo : photo + 1])
+
+
 class CoarseFewShotPipeline(CheckedPipeline):
     """Stage 1. nerfstudio's own steps on our data manager and model."""
 
@@ -45,8 +94,7 @@ class CoarseFewShotPipeline(CheckedPipeline):
     ) -> List[TrainingCallback]:
         """Adds the decision about empty space to nerfstudio's callbacks, and prepares the semantic loss.
 
-        Raises:
-            InputError: there can be no semantic loss with these settings, these photos or these weights.
+        InputError where there can be none with these settings, photos or weights.
         """
         weight, every = self.config.semantic_weight, self.config.semantic_every
         if not 0.0 <= weight < float("inf"):
@@ -70,8 +118,7 @@ class CoarseFewShotPipeline(CheckedPipeline):
         if side < backbone.smallest_side:
             raise InputError(f"--pipeline.semantic-side is {side}; give {backbone.smallest_side} or more pixels.")
         self.announce(backbone)
-        colors = pixels.colors.tensor_split(pixels.starts[1:-1])
-        photos = [rows.view(*size, 3) for rows, size in zip(colors, pixels.sizes, strict=True)]
+        photos = [pixels.colors[pixels.rows(view)].view(*size, 3) for view, size in enumerate(pixels.sizes)]
         return UnseenViews(backbone, cameras, photos, side)
 
     def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Any], Dict[str, Tensor], Dict[str, Any]]:
@@ -84,10 +131,8 @@ class CoarseFewShotPipeline(CheckedPipeline):
         return outputs, losses, metrics
 
     def decide_empty_space(self, step: int) -> None:
-        """After every tenth of the iterations from three quarters on, measures whether skipping empty space pays.
-
-        Before, the field is still half the fog that it starts as, and a measurement would say so.
-        """
+        """After every tenth of the iterations from three quarters on, measures whether skipping empty space pays."""
+        # Before, the field is still half the fog that it starts as, and a measurement would say so.
         done, total = step + 1, self.model.num_steps
         if done % max(1, total // 10) or not 3 * total <= 4 * done < 4 * total:
             return
@@ -98,7 +143,5 @@ class CoarseFewShotPipeline(CheckedPipeline):
         if self.effects.on("empty_space") != before:
             self.model.build_grid(self.effects)
             decision = self.effects["empty_space"]
-            CONSOLE.print(
-                f"Empty-space skipping is {'on' if decision.on else 'off'} from iteration {done} on: "
-                f"{decision.measured:.0%} {decision.reason}."
-            )
+            word, why = "on" if decision.on else "off", f"{decision.measured:.0%} {decision.reason}"
+            CONSOLE.print(f"Empty-space skipping is {word} from iteration {done} on: {why}.")

@@ -55,44 +55,38 @@ class FewShotDataManagerConfig(VanillaDataManagerConfig):
 
 @dataclass
 class TrainingPixels:
-    """All pixels of the training views with their rays; view i's are rows `starts[i]` to `starts[i + 1]`, row by row.
-
-    Attributes:
-        origins, directions: world rays, directions of unit length.
-        colors: in [0, 1], alpha composited on the background colour.
-        views: index of the training view.
-        starts: first row of each view, and the number of rows last.
-        sizes: (height, width) of each view.
-        trusted: rows that a mask, where there is one, leaves in.
-    """
+    """All pixels of the training views, view by view and row by row, with their world rays."""
 
     origins: Float[Tensor, "pixels 3"]
     directions: Float[Tensor, "pixels 3"]
+    """Of unit length."""
     colors: Float[Tensor, "pixels 3"]
+    """In [0, 1], alpha composited on the background colour."""
     views: Int[Tensor, "pixels"]
+    """Indices of training views."""
     starts: Tuple[int, ...]
+    """The first pixel of each view, and the number of all pixels last."""
     sizes: Tuple[Tuple[int, int], ...]
+    """(height, width) of each view."""
     trusted: Int[Tensor, "trusted"]
+    """Pixels that a mask, where there is one, leaves in."""
+
+    def rows(self, view: int) -> slice:
+        """Where the pixels of a view are."""
+        return slice(self.starts[view], self.starts[view + 1])
 
 
 class FewShotDataManager(VanillaDataManager[PhotoDataset]):
-    """Keeps the few training views, and all their rays, in memory.
+    """Chooses the views to train on (`select_views`), reduces large photos, and keeps all their rays in memory.
 
-    It chooses the views (`select_views`) and reduces large photos. The pipeline tells it by `set_effects` what was
-    decided about the scene; photos and rays are loaded after that.
-
-    Attributes:
-        train_dataparser_outputs: the views to train on, with their `SceneInfo`.
-        train_dataset, eval_dataset: their photos, and those of the held-out views.
-        pixels: the photos' pixels with their rays, once they are loaded.
-
-    Raises:
-        InputError: the scene or a setting can't be used.
+    The pipeline tells it by `set_effects` what was decided about the scene; photos and rays are loaded after that.
+    InputError where the scene or a setting can't be used.
     """
 
     config: FewShotDataManagerConfig
     effects: Optional[Decisions] = None
     pixels: TrainingPixels
+    """Once they are loaded."""
 
     def __init__(
         self,
@@ -105,7 +99,11 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         # In place of VanillaDataManager's, which reads the scene unchecked.
         self.config, self.device, self.test_mode = config, device, test_mode
         self.world_size, self.local_rank = world_size, local_rank
-        self._check_settings()
+        side, rays = config.max_image_side, config.train_num_rays_per_batch
+        if side is not None and side < SMALLEST_SIDE:
+            raise InputError(f"--max-image-side is {side}; give {SMALLEST_SIDE} pixels or more.")
+        if rays < 1:
+            raise InputError(f"--pipeline.datamanager.train-num-rays-per-batch is {rays}; give 1 or more.")
         if config.data is None:
             config.data = config.dataparser.data
         config.dataparser.data = config.data = Path(config.data)
@@ -115,7 +113,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         self.includes_time = self.dataparser.includes_time
         self.test_split = "val" if test_mode == "val" else "test"
         self.train_dataparser_outputs = self._chosen_views()
-        self.train_dataset = self.create_train_dataset()
+        self.train_dataset = self._dataset(self.train_dataparser_outputs)
         self.eval_dataset = self.create_eval_dataset()
         self.exclude_batch_keys_from_device = self.train_dataset.exclude_batch_keys_from_device
         if config.masks_on_gpu and "mask" in self.exclude_batch_keys_from_device:
@@ -124,20 +122,10 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
             config.collate_fn = variable_res_collate  # what nerfstudio does for photos of several sizes
         DataManager.__init__(self)
 
-    def _check_settings(self) -> None:
-        side, rays = self.config.max_image_side, self.config.train_num_rays_per_batch
-        if side is not None and side < SMALLEST_SIDE:
-            raise InputError(f"--max-image-side is {side}; give {SMALLEST_SIDE} pixels or more.")
-        if rays < 1:
-            raise InputError(f"--pipeline.datamanager.train-num-rays-per-batch is {rays}; give 1 or more.")
-
     def _chosen_views(self) -> DataparserOutputs:
-        """The views to train on."""
         outputs = read_scene(self.dataparser)
-        info, config = scene_info(outputs), self.config
-        chosen = select_views(
-            info.view_ids, config.num_views, config.view_ids, info.default_num_views, info.standard_views
-        )
+        info, asked = scene_info(outputs), (self.config.num_views, self.config.view_ids)
+        chosen = select_views(info.view_ids, *asked, info.default_num_views, info.standard_views)
         selected = select_outputs(outputs, chosen)
         if has_one_size(outputs.cameras):
             # Blender's cameras have the size of the first photo, also where that isn't trained on.
@@ -147,10 +135,6 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
             ids = ", ".join(str(info.view_ids[position]) for position in chosen)
             CONSOLE.print(f"Training on {len(chosen)} of {len(info.view_ids)} views: {ids} ({names}).")
         return selected
-
-    def create_train_dataset(self) -> PhotoDataset:
-        """The dataset of the chosen views."""
-        return self._dataset(self.train_dataparser_outputs)
 
     def create_eval_dataset(self) -> PhotoDataset:
         """The dataparser's whole held-out split; the training views where it holds out none, as of very few photos."""
@@ -177,10 +161,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         return Scene(self.train_dataparser_outputs)
 
     def set_effects(self, effects: Decisions) -> None:
-        """Takes over what was decided, before photos are loaded: whether lenses bend rays, and whether depth is known.
-
-        Photos are loaded now, so that one that can't be used is found at once; for mere inference they aren't needed.
-        """
+        """Takes over what was decided, and then loads photos, unless it is for mere inference, which needs none."""
         self.effects = effects
         if not effects.on("lens_distortion"):
             for dataset in (self.train_dataset, self.eval_dataset):
@@ -189,7 +170,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
             self.load_pixels()
 
     def load_pixels(self) -> None:
-        """Loads the training photos and generates all their rays, unless that is done already."""
+        """Loads the training photos with all their rays, unless that is done already."""
         if not hasattr(self, "pixels"):
             self.pixels = gather_pixels(self.train_dataset, self.device)
 
@@ -203,10 +184,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         """Nothing yet: rays are generated once it is decided whether lenses bend them (`set_effects`)."""
 
     def setup_eval(self) -> None:
-        """Makes sure that held-out photos can be used.
-
-        nerfstudio would keep all of them in memory, for batches of their pixels that are rarely needed (`next_eval`).
-        """
+        """Makes sure that held-out photos can be used; nerfstudio would keep all in memory for `next_eval`."""
         if self.test_mode == "val":
             for index in range(len(self.eval_dataset)):
                 self.eval_dataset.get_data(index, "uint8")
@@ -221,7 +199,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
     def next_train(self, step: int) -> Tuple[RayBundle, Dict[str, Any]]:
         """A batch of random pixels of all training views; the same for the same seed and step.
 
-        Where points are matched, rays to some of them come last. They have no colour, but their distance is in the
+        Where points are matched, rays to some of them come last, without colour, but with their distance in the
         bundle's metadata as `matched_distance`, which is 0 for the others.
         """
         self.train_count += 1
@@ -252,29 +230,19 @@ def has_one_size(cameras: Cameras) -> bool:
 
 def gather_pixels(dataset: InputDataset, device: Union[str, torch.device]) -> TrainingPixels:
     """Loads all images of a dataset and generates the ray of each pixel."""
-    rays, colors, views, starts, sizes, trusted = [], [], [], [0], [], []
+    parts, starts, sizes = [], [0], []
     for index in range(len(dataset)):
         data = dataset[index]
         image = data["image"][..., :3]
-        bundle = dataset.cameras.generate_rays(camera_indices=index, keep_shape=True)
-        height, width = image.shape[:2]
-        rays.append(torch.cat([bundle.origins, bundle.directions], dim=-1).reshape(-1, 6))
-        colors.append(image.reshape(-1, 3))
-        views.append(torch.full((height * width,), index))
-        mask = data["mask"].reshape(-1) > 0.5 if "mask" in data else torch.ones(height * width, dtype=torch.bool)
-        trusted.append(mask.nonzero().squeeze(-1) + starts[-1])
-        starts.append(starts[-1] + height * width)
-        sizes.append((height, width))
-    origins, directions = torch.cat(rays).to(device).split(3, dim=-1)
-    return TrainingPixels(
-        origins=origins.contiguous(),
-        directions=directions.contiguous(),
-        colors=torch.cat(colors).to(device),
-        views=torch.cat(views).to(device),
-        starts=tuple(starts),
-        sizes=tuple(sizes),
-        trusted=torch.cat(trusted).to(device),
-    )
+        rays = dataset.cameras.generate_rays(camera_indices=index, keep_shape=True).flatten()
+        count = len(rays)
+        mask = data["mask"].reshape(-1) > 0.5 if "mask" in data else torch.ones(count, dtype=torch.bool)
+        trusted = mask.nonzero().squeeze(-1) + starts[-1]
+        parts.append((rays.origins, rays.directions, image.reshape(-1, 3), torch.full((count,), index), trusted))
+        starts.append(starts[-1] + count)
+        sizes.append(tuple(image.shape[:2]))
+    *pixels, trusted = (torch.cat(part).to(device) for part in zip(*parts, strict=True))
+    return TrainingPixels(*pixels, tuple(starts), tuple(sizes), trusted)
 
 
 def bundle_rays(
@@ -284,10 +252,5 @@ def bundle_rays(
     metadata: Dict[str, Float[Tensor, "rays _"]],
 ) -> RayBundle:
     """A nerfstudio ray bundle of world rays and the training views that they belong to."""
-    return RayBundle(
-        origins=origins,
-        directions=directions,
-        pixel_area=torch.ones_like(origins[:, :1]),
-        camera_indices=views[:, None],
-        metadata=metadata,
-    )
+    area = torch.ones_like(origins[:, :1])
+    return RayBundle(origins, directions, area, camera_indices=views[:, None], metadata=metadata)

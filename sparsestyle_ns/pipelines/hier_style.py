@@ -25,13 +25,6 @@ from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress import say
 
 
-class StyleInputs(NamedTuple):
-    """What a style is made from, read once a run: the painting, and the feature network."""
-
-    painting: Painting
-    backbone: Backbone
-
-
 @dataclass
 class HierStylePipelineConfig(CheckedPipelineConfig):
     """Settings of stage 2."""
@@ -66,36 +59,29 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     cache_gigabytes: Optional[float] = None
     """Memory for what never changes of the views; None: a quarter of what is free."""
 
-    def load_style(self) -> StyleInputs:
-        """The painting and the feature network, on the CPU.
-
-        Raises:
-            InputError: there is no style image or no weights, or they can't be read, or a setting is out of its range.
-        """
+    def load_style(self) -> Tuple[Painting, Backbone]:
+        """The painting and the feature network, on the CPU; InputError where these or a setting can't be used."""
         if self.style_features is not None and self.style_features < 1:
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
         for name, weight in self.loss_weights.items():
             if name not in LOSSES:
-                raise InputError(
-                    f"--pipeline.loss-weights names {name}, which is no loss; the losses are {', '.join(LOSSES)}."
-                )
+                known = ", ".join(LOSSES)
+                raise InputError(f"--pipeline.loss-weights names {name}, which is no loss; the losses are {known}.")
             if not 0.0 <= weight < math.inf:
                 raise InputError(f"--pipeline.loss-weights.{name} is {weight}; give a finite number, 0 or more.")
         if not any(self.loss_weights.values()):
             raise InputError("--pipeline.loss-weights turns every loss off; give one of them a weight above 0.")
         if self.style_image is None:
             raise InputError("There is no style image: name a painting with --style-image FILE.")
-        return StyleInputs(Painting.read(self.style_image), self.load_backbone(torch.device("cpu")))
+        return Painting.read(self.style_image), self.load_backbone(torch.device("cpu"))
 
-    def targets_of(self, style: StyleInputs, device: torch.device) -> StyleTargets:
+    def targets_of(self, painting: Painting, backbone: Backbone, device: torch.device) -> StyleTargets:
         """A painting as the feature network sees it, with these settings; the network moves to the device."""
-        image, backbone = style.painting.pixels.to(device), style.backbone.to(device)
-        losses = [name for name, weight in self.loss_weights.items() if weight > 0]
-        side = self.style_side or self.feature_side
-        return StyleTargets(backbone, image, self.feature_side, side, self.style_features, losses)
+        sides, losses = (self.feature_side, self.style_side or self.feature_side), list(self.weights_at(0))
+        return StyleTargets(backbone.to(device), painting.pixels.to(device), *sides, self.style_features, losses)
 
     def weights_at(self, step: int) -> Dict[str, float]:
-        """The weight of each loss in an iteration; that of the content loss is λ(t) (Eq. 6)."""
+        """The weight of each loss that is on, in an iteration; that of the content loss is λ(t) (Eq. 6)."""
         weights = {name: weight for name, weight in self.loss_weights.items() if weight > 0}
         if "content" in weights:
             weights["content"] = content_weight(step, weights["content"], self.content_decay, self.content_steps)
@@ -103,7 +89,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
 
 
 class StyleTask(NamedTuple):
-    """A field that is on its way to a painting, and the views that it is stylised on; in turn, one an iteration."""
+    """A field that is on its way to a painting, and the views that it is stylised on, one an iteration."""
 
     style: nn.Module
     targets: StyleTargets
@@ -124,46 +110,44 @@ class HierStylePipeline(CheckedPipeline):
     """Told of each iteration and its losses, by a viewer that shows them."""
 
     def new_task(self, style: nn.Module, targets: StyleTargets, effects: Decisions) -> StyleTask:
-        """A field and a painting for the scene's views; what of these depends on no painting is shared."""
+        """A field and a painting for the scene's views, which are shared as far as they depend on no painting."""
         if self.scene_views is None:
             self.scene_views = self.freeze_views()
         return StyleTask(style, targets, self.scene_views.for_painting(targets, effects))
 
     def freeze_views(self) -> SceneViews:
         """The scene's views, with all that depends on no style."""
-        config, photos = self.config, self.datamanager.pixels
-        cameras = self.datamanager.train_dataset.cameras
-        sizes = config.novel_views, config.samples_per_chunk, config.cache_gigabytes
-        return SceneViews(self.model, photos, cameras, *sizes)
+        sizes = self.config.novel_views, self.config.samples_per_chunk, self.config.cache_gigabytes
+        return SceneViews(self.model, self.datamanager, *sizes)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> List[TrainingCallback]:
         """Prepares the style and the views, as far as they aren't there already."""
         if self.targets is None:
-            self.targets = self.config.targets_of(self.config.load_style(), self.device)
+            self.targets = self.config.targets_of(*self.config.load_style(), self.device)
         self.announce(self.targets.backbone)
         self.task = self.new_task(self.model.residual, self.targets, self.effects)
         say(self.scene_views.report())
         return super().get_training_callbacks(training_callback_attributes)
 
     def style_targets(self, style_image: Optional[Path] = None) -> Optional[StyleTargets]:
-        """The painting to measure against, where it is still there; another one than the run's where that is given."""
+        """The painting to measure against, the run's own or another, where it is still there."""
         if self.targets is not None and style_image is None:
             return self.targets
         path = style_image or self.config.style_image
         if path is None or not path.is_file():
             say(f"The painting {path} isn't there any more, so nothing is measured against it.")
             return None
-        return self.config.targets_of(replace(self.config, style_image=path).load_style(), self.device)
+        return self.config.targets_of(*replace(self.config, style_image=path).load_style(), self.device)
 
     def warm_start_loss(self, task: StyleTask, step: int) -> Dict[str, Float[Tensor, ""]]:
         """How far c_f, on the coarse geometry, is from the content picture of one photo; not in the paper.
 
-        The features of VGG's third block hardly see colour; stylising from grey loses the palette. A coarse field that
-        is fine-tuned itself is fitted as a whole: its colours can't change with its geometry held.
+        The features of VGG's third block hardly see colour; stylising from grey loses the palette.
         """
         view = task.views[step % self.scene_views.num_photos]
+        # A coarse field that is fine-tuned itself is fitted as a whole: it can't change colours with its geometry held.
         coarse_geometry = self.model.config.stylised_field == "residual"
         picture = self.scene_views.render(view, task.style, coarse_geometry)
         return {"reconstruction_loss": reconstruction_loss(picture, view.picture)}

@@ -14,7 +14,7 @@ from sparsestyle_ns.core.camera_paths import at_poses, poses_between
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.models.hier_style import HierStyleModel
-from sparsestyle_ns.pipelines.datamanager import TrainingPixels
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, TrainingPixels
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.render import accumulation_of, seen_behind
 from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
@@ -42,8 +42,6 @@ class SceneViews:
 
     Args:
         model: whose coarse field is final.
-        pixels: of the photos.
-        cameras: of the photos.
         novel_views: how many views between the photos there are.
         samples_per_chunk: samples that are rendered at once, at most.
         cache_gigabytes: memory for what never changes; None: a quarter of what is free.
@@ -53,12 +51,12 @@ class SceneViews:
     def __init__(
         self,
         model: HierStyleModel,
-        pixels: TrainingPixels,
-        cameras: Cameras,
+        manager: FewShotDataManager,
         novel_views: int,
         samples_per_chunk: int,
         cache_gigabytes: Optional[float],
     ) -> None:
+        pixels = manager.pixels
         self.model, self.samples_per_chunk = model, samples_per_chunk
         self.num_photos = len(pixels.sizes)
         if cache_gigabytes is None:
@@ -67,7 +65,7 @@ class SceneViews:
             cache_gigabytes = free / 2**30 / 4 / num_processes()
         self._bytes_left = cache_gigabytes * 2**30
         self.views = [self._photo_view(pixels, index) for index in track(range(self.num_photos), "Caching views")]
-        novel = cameras_between(cameras, novel_views)
+        novel = cameras_between(manager.train_dataset.cameras, novel_views)
         self.views += [self._novel_view(camera) for camera in track(novel, "Caching novel views")]
 
     def _freeze(self, origins: Tensor, directions: Tensor) -> FrozenView:
@@ -78,8 +76,7 @@ class SceneViews:
         return frozen
 
     def _photo_view(self, pixels: TrainingPixels, index: int) -> ContentView:
-        height, width = pixels.sizes[index]
-        rows = slice(pixels.starts[index], pixels.starts[index + 1])
+        (height, width), rows = pixels.sizes[index], pixels.rows(index)
         frozen = self._freeze(pixels.origins[rows], pixels.directions[rows])
         accumulation = gather_rays(frozen.render(accumulation_of), height * width)
         colors, exposure = pixels.colors[rows], self.model.exposure
@@ -90,7 +87,7 @@ class SceneViews:
     def _novel_view(self, camera: Cameras) -> ContentView:
         bundle = camera.generate_rays(camera_indices=0, keep_shape=True).to(self.model.device)
         rays = bundle.flatten()
-        with self.model.rendering("exact"):  # a viewer may restyle a run whose pictures are baked
+        with self.model.display.rendering("exact"):  # a viewer may restyle a run whose pictures are baked
             outputs = self.model.get_outputs_for_camera_ray_bundle(bundle)
         frozen = self._freeze(rays.origins, rays.directions)
         return ContentView(frozen, outputs["rgb_coarse"], outputs["accumulation_coarse"].squeeze(-1))
@@ -107,7 +104,7 @@ class SceneViews:
         return views if self.model.background is not None else [replace(view, accumulation=None) for view in views]
 
     def _in_style_colors(self, targets: StyleTargets) -> Iterator[Tuple[ContentView, Tensor]]:
-        """Views, and their pictures in the painting's colours; where the scene is transparent, the background stays."""
+        """Views, and their pictures in the painting's colours; a background that is seen through the scene stays."""
         photos = self.views[: self.num_photos]
         colors = torch.cat([view.picture.reshape(-1, 3) for view in photos])
         weight = torch.cat([view.accumulation.reshape(-1) for view in photos])
@@ -120,7 +117,7 @@ class SceneViews:
             yield view, picture
 
     def render(self, view: ContentView, style: nn.Module, coarse_geometry: bool = False) -> Float[Tensor, "H W 3"]:
-        """The stylised picture of a view, of which each process renders its share of the rays; differentiable."""
+        """The stylised picture of a view, to whose rays each process contributes its share; differentiable."""
         own = view.frozen.render(lambda chunk: self.model.stylised(chunk, coarse_geometry, style).rgb)
         return gather_rays(own, view.picture[..., 0].numel()).view(view.picture.shape)
 

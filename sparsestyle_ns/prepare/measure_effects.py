@@ -1,46 +1,60 @@
 """Deciding about a scene's effects without training: `sparsestyle effects`."""
 
 import copy
-from pathlib import Path
-from typing import Optional, Tuple
+import sys
+from contextlib import redirect_stdout
+from typing import List
 
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 
+from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.effects.base import Decisions, EffectSettings
 from sparsestyle_ns.effects.registry import decide
+from sparsestyle_ns.engine.hints import PAINTING, finish, flags_of, parser_arguments
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
+from sparsestyle_ns.prepare.prepare_options import EffectsOptions
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
+from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD
 from sparsestyle_ns.runs.scene_record import record_scene
 from sparsestyle_ns.style.painting import Painting
 
 
-def measure_scene(
-    dataparser: DataParserConfig,
-    data: Path,
-    num_views: Optional[int] = None,
-    view_ids: Optional[Tuple[int, ...]] = None,
-    coarse_run: Optional[Path] = None,
-    style_image: Optional[Path] = None,
-) -> Decisions:
-    """What ns-train would decide with everything on auto.
+def print_effects(options: EffectsOptions) -> None:
+    """Prints the decisions, and what to type next; beside JSON, that goes to stderr."""
+    parser = parse_dataparser(options.dataparser, options.data)
+    with redirect_stdout(sys.stderr):  # what dataparsers print must not get into the JSON
+        decisions = measure_scene(parser, options)
+    print(decisions.json() if options.json else decisions.text(), flush=True)
+    with redirect_stdout(sys.stderr if options.json else sys.stdout):
+        finish(None, next_command(parser, options))
 
-    Args:
-        coarse_run: a run of the scene to measure the effects of stage 2 on; without one they are assumed.
-        style_image: the painting; without one its palette counts as another than the photos'.
+
+def next_command(dataparser: DataParserConfig, options: EffectsOptions) -> List[str]:
+    """Training on the scene, with the painting where there is a coarse run."""
+    command = ["ns-train", COARSE_METHOD]
+    if options.coarse_run is not None:
+        command = ["ns-train", STYLE_METHOD, "--style-image", str(options.style_image or PAINTING)]
+    command += flags_of("--coarse-run", options.coarse_run)
+    command += flags_of("--num-views", options.num_views) + flags_of("--view-ids", options.view_ids)
+    return [*command, "--data", str(options.data), *parser_arguments(dataparser)]
+
+
+def measure_scene(dataparser: DataParserConfig, options: EffectsOptions) -> Decisions:
+    """What ns-train would decide with everything on auto.
 
     Raises:
         InputError: something can't be read, or the run is of another scene.
     """
     config = FewShotDataManagerConfig(
-        data=data, dataparser=copy.deepcopy(dataparser), num_views=num_views, view_ids=view_ids
+        data=options.data, dataparser=copy.deepcopy(dataparser), num_views=options.num_views, view_ids=options.view_ids
     )
     manager = config.setup(device="cpu", test_mode="inference")
     scene = manager.scene
     effects = decide(scene, EffectSettings())
-    if coarse_run is not None:
-        run = read_coarse_run(coarse_run)
-        check_scene(run, record_scene(data, manager.train_dataparser_outputs, effects))
+    if options.coarse_run is not None:
+        run = read_coarse_run(options.coarse_run)
+        check_scene(run, record_scene(options.data, manager.train_dataparser_outputs, effects))
         scene.coarse_density = run.density(effects)
-    if style_image is not None:
-        scene.style_image = Painting.read(style_image).pixels
+    if options.style_image is not None:
+        scene.style_image = Painting.read(options.style_image).pixels
     return decide(scene, EffectSettings(), effects)

@@ -12,9 +12,11 @@ from typing import List, Literal, Sequence
 
 import torch
 
+from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.prepare.diagnosis import check_photos
 from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, find_photos, frame_photos, write_photos
 from sparsestyle_ns.prepare.poses import TRANSFORMS, find_poses, read_for_pose, say_what_is_turned
+from sparsestyle_ns.prepare.prepare_options import PrepareOptions
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.machine import put_ffmpeg_on_path
 
@@ -28,6 +30,13 @@ class PreparedScene:
     folder: Path
     parser: str
     names: List[str]
+
+
+def prepare(options: PrepareOptions) -> None:
+    """Makes a scene of photos, and says where it is; see `prepare_scene`."""
+    scene = prepare_scene(options.photos, options.output, options.poses)
+    made = f"{scene.folder}, {len(scene.names)} photos with poses"
+    finish(made, ["ns-train", "coarse-fewshot", "--data", scene.folder, scene.parser])
 
 
 def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> PreparedScene:

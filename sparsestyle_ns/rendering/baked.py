@@ -1,9 +1,8 @@
 """Baked rendering: the two fields kept in a voxel grid of the cube, which is filled where rays come by.
 
-σ_f, c_f and σ_c depend on the position alone, so that a value worked out for one picture serves all others. The first
-picture of a scene takes as long as an exact one, later ones what looking values up takes, whatever mixture of the
-fields they show (`mixing`). Samples, empty cells and early stops are those of the exact render (`freeze_samples`,
-`render_mixed`); what differs is that values between voxels are interpolated.
+σ_f, c_f and σ_c depend on the position alone, so that a value worked out for one picture serves all others, whatever
+mixture of the fields they show (`mixing`). Samples, empty cells and early stops are those of the exact render
+(`freeze_samples`, `render_mixed`); what differs is that values between voxels are interpolated.
 
 A value takes a byte. Densities are kept as their logarithm, and interpolated so: they are exponentials of a smooth
 function, and their error then shows hardly beside that of the colours (fern, 256³ voxels: 42.2 dB against the exact
@@ -11,30 +10,24 @@ picture with logarithms, 40.2 dB with densities; bytes instead of floats cost 0.
 """
 
 import math
-from typing import Callable, Optional, Tuple
+import threading
+from typing import Callable, Dict, Iterable, List, Optional, Sequence, Tuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
-from torch import Tensor
+from torch import Tensor, nn
 
+from sparsestyle_ns.core import spaces
 from sparsestyle_ns.core.occupancy import Occupancy
 from sparsestyle_ns.core.precision import Precision, autocast
 from sparsestyle_ns.core.sampling import even_edges
-from sparsestyle_ns.core.spaces import (
-    MAX_DISTANCE,
-    ContractedSegments,
-    ForwardFacingSpace,
-    LinearSegments,
-    Segments,
-    Space,
-    spacing,
-)
+from sparsestyle_ns.core.spaces import Segments, Space
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.rendering import baked_kernels
 from sparsestyle_ns.rendering.mixing import STYLISED, Appearance, Mix, mixed
-from sparsestyle_ns.rendering.render import POINTS_PER_CALL, PackedRender, composite, render_packed
+from sparsestyle_ns.rendering.render import POINTS_PER_CALL, Background, PackedRender, composite, render_packed
 from sparsestyle_ns.rendering.visible_samples import Marching, visible_samples
 from sparsestyle_ns.utils.numba_kernels import even_parts, run_on_threads
 
@@ -55,9 +48,9 @@ DENSITY_STEP = math.log1p(MAX_DENSITY / DENSITY_UNIT) / 254
 ROUNDING = 1e-3
 """Part of a code's step that interpolation may be off; less than that above the code of 0 is 0 (an infinite interval
 makes anything else opaque)."""
-AHEAD = ((0.0, 0.0, -1.0),)
-"""Where cameras of a forward-facing scene look."""
 ALL_AROUND = ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
+MOST_BAKED = 4
+"""Styles whose volumes are kept."""
 RAYS_PER_PART = 512
 """Rays that a thread marches before it takes the next part: they end early or late, and threads shouldn't wait."""
 
@@ -84,8 +77,8 @@ def shade_of(field: CoarseField, style: StylisedField, space: Space, precision: 
     scene, and elsewhere the mean over the directions of the axes; c_f and the densities depend on no direction.
     """
     seen_from = ALL_AROUND
-    if field.direction_encoding is None or isinstance(space, ForwardFacingSpace):
-        seen_from = AHEAD
+    if field.direction_encoding is None or isinstance(space, spaces.ForwardFacingSpace):
+        seen_from = ((0.0, 0.0, -1.0),)
 
     def shade(points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 8"]:
         with autocast(points.device, precision):
@@ -102,13 +95,8 @@ def shade_of(field: CoarseField, style: StylisedField, space: Space, precision: 
 class BakedVolume:
     """σ_c, σ_f, c_f and c_c on a grid of the cube [−1, 1]³, filled where it is asked for.
 
-    Voxels lie in bricks of 8³, and a brick takes memory, 4 KiB, from its first value on: at most 147 MB with 256 cells
-    along a side, where rays have been everywhere. Outside of the cube the values on its border count.
-
-    Args:
-        shade: the fields.
-        resolution: cells along a side; voxels lie at their corners.
-        device: where the values are kept.
+    Voxels lie at the corners of `resolution` cells along a side, in bricks of 8³. A brick takes memory, 4 KiB, from its
+    first value on: at most 147 MB with 256 cells along a side. Outside of the cube the values on its border count.
     """
 
     def __init__(self, shade: Shade, resolution: int, device: torch.device) -> None:
@@ -128,12 +116,6 @@ class BakedVolume:
         """Memory that it takes now."""
         return self.codes.numel() + 4 * self.slots.numel()
 
-    def cells(self, positions: Float[Tensor, "points 3"]) -> Tuple[Int[Tensor, "points 3"], Float[Tensor, "points 3"]]:
-        """The voxel at the lower corner of each position's cell, and where in its cell a position lies, in [0, 1]."""
-        scaled = (0.5 * positions + 0.5).clamp(0.0, 1.0) * self.resolution
-        lower = scaled.long().clamp(0, self.resolution - 1)
-        return lower, scaled - lower
-
     def rows(self, voxels: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
         """Where the codes of voxels lie."""
         x, y, z = (voxels // SIDE).unbind(-1)
@@ -143,11 +125,7 @@ class BakedVolume:
 
     @torch.no_grad()
     def fill(self, cells: Int[Tensor, "cells 3"]) -> None:
-        """Evaluates the voxels at the corners of cells, those that haven't been before.
-
-        Args:
-            cells: their lower corners.
-        """
+        """Evaluates the voxels at the corners of cells, given by their lower ones, that haven't been before."""
         lower = _unravel(_ravel(cells, self.resolution).unique(), self.resolution)
         voxels = (lower[:, None] + self._offsets).flatten(0, 1)
         voxels = voxels[self.codes.view(-1, 8)[self.rows(voxels), 0] == 0]
@@ -171,19 +149,17 @@ class BakedVolume:
         slots = torch.arange(first, self.num_slots, dtype=torch.int32, device=self.slots.device)
         self.slots.view(-1)[bricks] = slots
 
-    def values(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points 8"]:
-        """What `shade` gives, interpolated, with what is missing filled in first."""
-        lower, fraction = self.cells(positions)
-        self.fill(lower)
-        near = torch.where(self._offsets.bool(), fraction[:, None], 1.0 - fraction[:, None])
-        codes = self.codes.view(-1, 8)[self.rows(lower[:, None] + self._offsets)]
-        return decode((near.prod(dim=-1)[..., None] * codes).sum(dim=1))
-
     def density_and_feature(
         self, positions: Float[Tensor, "points 3"]
     ) -> Tuple[Float[Tensor, "points"], Float[Tensor, "points 7"]]:
-        """σ_c, and all others as the feature: a coarse field as far as `visible_samples` is concerned."""
-        values = self.values(positions)
+        """σ_c, and all else that `shade` gives as the feature, interpolated, with what is missing filled in first."""
+        scaled = (0.5 * positions + 0.5).clamp(0.0, 1.0) * self.resolution
+        lower = scaled.long().clamp(0, self.resolution - 1)
+        fraction = scaled - lower
+        self.fill(lower)
+        near = torch.where(self._offsets.bool(), fraction[:, None], 1.0 - fraction[:, None])
+        codes = self.codes.view(-1, 8)[self.rows(lower[:, None] + self._offsets)]
+        values = decode((near.prod(dim=-1)[..., None] * codes).sum(dim=1))
         return values[:, 0], values[:, 1:]
 
 
@@ -195,60 +171,30 @@ def _unravel(index: Int[Tensor, "points"], size: int) -> Int[Tensor, "points 3"]
     return torch.stack([index // size**2, index // size % size, index % size], dim=-1)
 
 
-ONE_CELL = np.ones((1, 1, 1), dtype=bool)
-"""The kernels' grid where nothing is skipped."""
-
-
-@torch.no_grad()
 def render_baked(
-    volume: BakedVolume,
-    segments: Segments,
-    marching: Marching,
-    background: Optional[Float[Tensor, "3"]],
-    mix: Mix = STYLISED,
-    second: Optional[BakedVolume] = None,
+    volumes: Sequence[BakedVolume], segments: Segments, marching: Marching, background: Background, mix: Mix = STYLISED
 ) -> Tuple[PackedRender, PackedRender]:
-    """The render of a mixture of the fields, by default the stylised one, and the coarse render.
-
-    Args:
-        mix: how much of each field counts.
-        second: of another style, with the same coarse field and resolution.
-    """
-    march = march_compiled if volume.codes.device.type == "cpu" else march_in_torch
-    return march(volume, segments, marching, background, mix, second)
+    """The render of a mixture of one or two styles, which share coarse field and resolution, and the coarse render."""
+    march = march_compiled if volumes[0].codes.device.type == "cpu" else march_in_torch
+    return march(volumes, segments, marching, background, mix)
 
 
 @torch.no_grad()
 def march_in_torch(
-    volume: BakedVolume,
-    segments: Segments,
-    marching: Marching,
-    background: Optional[Float[Tensor, "3"]],
-    mix: Mix = STYLISED,
-    second: Optional[BakedVolume] = None,
+    volumes: Sequence[BakedVolume], segments: Segments, marching: Marching, background: Background, mix: Mix = STYLISED
 ) -> Tuple[PackedRender, PackedRender]:
     """`render_baked` on any device: the exact render, with the volumes in the fields' place."""
-    samples, density, values = visible_samples(volume, segments, marching)
-    coarse, styles = Appearance(density, values[:, 4:]), [_style(values)]
-    if second is not None:
-        styles.append(_style(second.density_and_feature(samples.positions)[1]))
+    samples, density, values = visible_samples(volumes[0].density_and_feature, segments, marching)
+    found = [values, *(volume.density_and_feature(samples.positions)[1] for volume in volumes[1:])]
+    coarse, styles = Appearance(density, values[:, 4:]), [Appearance(each[:, 0], each[:, 1:4]) for each in found]
     num_rays = len(segments.hit)
     render = render_packed(samples, num_rays, *mixed(coarse, styles, mix), background)
     return render, render_packed(samples, num_rays, *coarse, background)
 
 
-def _style(feature: Float[Tensor, "points 7"]) -> Appearance:
-    return Appearance(feature[:, 0], feature[:, 1:4])
-
-
 @torch.no_grad()
 def march_compiled(
-    volume: BakedVolume,
-    segments: Segments,
-    marching: Marching,
-    background: Optional[Float[Tensor, "3"]],
-    mix: Mix = STYLISED,
-    second: Optional[BakedVolume] = None,
+    volumes: Sequence[BakedVolume], segments: Segments, marching: Marching, background: Background, mix: Mix = STYLISED
 ) -> Tuple[PackedRender, PackedRender]:
     """`render_baked` on a CPU: rays are marched until none has come by a voxel that isn't filled."""
     lines = _lines(segments, marching)
@@ -257,24 +203,20 @@ def march_compiled(
     shares = tuple(map(np.float32, (mix.density_share, mix.strength, mix.blend)))
     while len(left):
         missing = torch.full((len(left), baked_kernels.LOOKAHEAD), baked_kernels.NO_CELL)
-        voxels = [None if each is None else _voxels(each, marching.occupancy) for each in (volume, second)]
+        voxels = (*(_voxels(each, marching.occupancy) for each in volumes), None)[:2]
         results = (lines, *voxels, shares, np.float32(marching.min_transmittance), sums.numpy(), missing.numpy())
         parts = even_parts(len(left), -(-len(left) // RAYS_PER_PART))
         run_on_threads(baked_kernels.march_rays, [(left.numpy(), *part, *results) for part in parts])
         found = missing != baked_kernels.NO_CELL
         left = left[found[:, 0]]
-        if len(left):
-            cells = _unravel(missing[found], volume.resolution)
-            volume.fill(cells)
-            if second is not None:
-                second.fill(cells)
+        for each in volumes if len(left) else []:
+            each.fill(_unravel(missing[found], each.resolution))
     return composite(sums[:, :5], background), composite(sums[:, 5:], background)
 
 
 def _voxels(volume: BakedVolume, occupancy: Optional[Occupancy]) -> baked_kernels.Voxels:
-    """A volume in the kernels' form."""
     return baked_kernels.Voxels(
-        ONE_CELL if occupancy is None else occupancy.occupied.numpy(),
+        np.ones((1, 1, 1), dtype=bool) if occupancy is None else occupancy.occupied.numpy(),
         volume.slots.numpy(),
         volume.codes.numpy().view("<u8").squeeze(-1),
         volume.resolution,
@@ -283,21 +225,67 @@ def _voxels(volume: BakedVolume, occupancy: Optional[Occupancy]) -> baked_kernel
 
 
 def _lines(segments: Segments, marching: Marching) -> baked_kernels.Lines:
-    """Segments in the kernels' form."""
-    spaced = torch.zeros(2)
-    if isinstance(segments, ContractedSegments):
+    spaced, bent = torch.zeros(2), isinstance(segments, spaces.ContractedSegments)
+    if bent:
         parts = segments.origins, segments.directions
-        ends = spacing(torch.tensor([segments.near, MAX_DISTANCE]))
+        ends = spaces.spacing(torch.tensor([segments.near, spaces.MAX_DISTANCE]))
         spaced = torch.stack([ends[0], ends[1] - ends[0]])
-    elif isinstance(segments, LinearSegments):
+    elif isinstance(segments, spaces.LinearSegments):
         parts = segments.start, segments.extent
     else:
         raise TypeError(f"{type(segments).__name__} has no compiled form; use march_in_torch.")
     return baked_kernels.Lines(
         values=torch.cat(parts, dim=-1).float().numpy(),
         hit=segments.hit.numpy(),
-        bent=isinstance(segments, ContractedSegments),
+        bent=bent,
         unbounded=marching.unbounded,
         spaced=spaced.numpy(),
         edges=even_edges(1, marching.num_steps, segments.hit.device)[0].numpy(),
     )
+
+
+class BakedCache:
+    """Keeps a baked volume for each of the styles that were shown last, for as long as no weight in it changes.
+
+    `bake` makes a style's volume, with nothing in it yet; `shared` gives the modules that the pictures of all styles
+    depend on. Any number of threads may render: they take turns.
+    """
+
+    def __init__(self, bake: Callable[[StylisedField], BakedVolume], shared: Callable[[], Iterable[nn.Module]]) -> None:
+        self._bake, self._shared = bake, shared
+        self.volumes: Dict[StylisedField, Tuple[BakedVolume, List[Tensor]]] = {}
+        """By style, the volume and the weights that it was made of; the style that was shown last comes last."""
+        self._lock = threading.Lock()  # volumes grow while they are rendered, and a viewer has several threads
+
+    def render(
+        self,
+        styles: Sequence[StylisedField],
+        segments: Segments,
+        marching: Marching,
+        background: Background,
+        mix: Mix = STYLISED,
+    ) -> Tuple[PackedRender, PackedRender]:
+        """`render_baked` of one or two styles; what these rays need and the volumes don't have yet is filled in."""
+        with self._lock:
+            return render_baked(list(map(self._current, styles)), segments, marching, background, mix)
+
+    def kept(self, style: StylisedField) -> Optional[BakedVolume]:
+        """The volume of a style's next picture; None where it would start a new one, as when weights have changed."""
+        volume, known = self.volumes.get(style, (None, []))
+        return volume if volume is not None and all(map(torch.equal, known, self._weights(style))) else None
+
+    def _current(self, style: StylisedField) -> BakedVolume:
+        """A style's volume, a new one if what it shows has changed since the last picture."""
+        weights, volume = self._weights(style), self.kept(style) or self._bake(style)
+        # The viewer may break a picture off between any two lines; here that loses nothing.
+        others = {each: kept for each, kept in self.volumes.items() if each is not style}
+        self.volumes = dict([*others.items(), (style, (volume, weights))][-MOST_BAKED:])
+        return volume
+
+    def _weights(self, style: StylisedField) -> List[Tensor]:
+        """What changes with every change of the weights that a style's pictures show, and is quick to compare."""
+        # torch doesn't count the changes that fused optimisers make; these change every parameter of the residual MLP.
+        tensors = [tensor for part in (*self._shared(), style) for tensor in (*part.parameters(), *part.buffers())]
+        versions = torch.tensor([(tensor.data_ptr(), tensor._version) for tensor in tensors])
+        values = [parameter for name, parameter in style.named_parameters() if not name.startswith("grid")]
+        return [versions, torch.cat([value.detach().flatten() for value in values])]

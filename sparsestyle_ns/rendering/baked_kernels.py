@@ -22,42 +22,29 @@ _BITS_8, _BITS_16, _BITS_24, _BITS_32, _BITS_40, _BITS_48, _BITS_56 = (np.uint64
 
 
 class Lines(NamedTuple):
-    """Rays, in the two forms that segments have.
-
-    Attributes:
-        values: start and extent of a straight segment in field coordinates, or origin, in the contraction's unit, and
-            direction of a ray that it bends; six numbers a ray.
-        hit: whether a ray meets the scene.
-        bent: which of the two forms it is.
-        unbounded: whether the last interval is infinite.
-        spaced: for bent rays, g of the distance at s = 0, and how much further g is at s = 1.
-        edges: borders of the samples in s, the same for every ray.
-    """
+    """Rays, in the two forms that segments have."""
 
     values: np.ndarray
+    """Six numbers a ray: start and extent of a straight segment in field coordinates, or origin, in the contraction's
+    unit, and direction of a ray that it bends."""
     hit: np.ndarray
+    """Whether a ray meets the scene."""
     bent: bool
     unbounded: bool
+    """Whether the last interval is infinite."""
     spaced: np.ndarray
+    """For bent rays, g of the distance at s = 0, and how much further g is at s = 1."""
     edges: np.ndarray
+    """Borders of the samples in s, the same for every ray."""
 
 
 class Voxels(NamedTuple):
-    """What rays go through: see `Occupancy` and `BakedVolume`.
-
-    Attributes:
-        occupied: cells of the cube that hold anything.
-        slots: where each brick's values lie, by brick.
-        words: the eight codes of a voxel, the first in the lowest byte, by slot and place in the brick.
-        resolution: cells between voxels along a side of the cube.
-        unit: the density at which codes go from linear to logarithmic.
-        step: difference of log(1 + density/unit) between neighbouring codes.
-        rounding: part of a step that codes may be off.
-    """
+    """What rays go through: see `Occupancy` and `BakedVolume`, and `DENSITY_UNIT` and what follows it there."""
 
     occupied: np.ndarray
     slots: np.ndarray
     words: np.ndarray
+    """The eight codes of a voxel, the first in the lowest byte, by slot and place in the brick."""
     resolution: int
     unit: np.float32
     step: np.float32
@@ -190,8 +177,6 @@ def march_rays(rays, start, end, lines, voxels, second, shares, min_transmittanc
     """Adds up the samples of `rays[start:end]`, as `render_packed` does.
 
     Args:
-        rays: indices of rays.
-        voxels: both fields.
         second: the same with another style, or None; what becomes of None is compiled without it.
         shares: of the style in the density and in the colour, and of the second style in the style (see `mixing`).
         sums: result, by ray: rgb, Σw and Σws of the mixed field, and the same of the coarse one.

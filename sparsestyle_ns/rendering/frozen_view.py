@@ -5,6 +5,7 @@ checkpointing: its activations are computed again in the backward pass, so that 
 all at once while only one chunk's activations exist at a time.
 """
 
+from functools import partial
 from typing import Callable, List, Optional
 
 import torch
@@ -29,30 +30,21 @@ def split_by_samples(counts: Int[Tensor, "rays"], max_samples: int) -> List[slic
 class FrozenView:
     """The rays of one view, cut into chunks, with the frozen part of each chunk's work kept or done again each time.
 
-    Args:
-        runs: the rays of each chunk.
-        freeze: gives the frozen samples of a run of rays.
-        keep_bytes: memory that kept chunks may take; chunks past it are frozen again whenever they are rendered.
+    Kept chunks take at most `keep_bytes` of memory; those past it are frozen again whenever they are rendered.
     """
 
-    def __init__(
-        self,
-        runs: List[slice],
-        freeze: Callable[[slice], FrozenSamples],
-        keep_bytes: float,
-    ) -> None:
+    def __init__(self, runs: List[slice], freeze: Callable[[slice], FrozenSamples], keep_bytes: float) -> None:
         self.runs = runs
         self.freeze = freeze
         self.kept: List[Optional[FrozenSamples]] = []
         self.kept_bytes = 0
         for run in runs:
             frozen = freeze(run) if self.kept_bytes < keep_bytes else None
-            if frozen is not None and self.kept_bytes + frozen.num_bytes <= keep_bytes:
-                self.kept_bytes += frozen.num_bytes
-                self.kept.append(frozen)
+            if frozen is None or self.kept_bytes + frozen.num_bytes > keep_bytes:
+                frozen, keep_bytes = None, 0
             else:
-                keep_bytes = 0
-                self.kept.append(None)
+                self.kept_bytes += frozen.num_bytes
+            self.kept.append(frozen)
 
     @property
     def num_chunks(self) -> int:
@@ -75,8 +67,7 @@ class FrozenView:
         def run(index: int) -> Tensor:
             return render_chunk(self.chunk(index))
 
-        if self.num_chunks == 1 or not torch.is_grad_enabled():
-            return torch.cat([run(index) for index in range(self.num_chunks)])
-        return torch.cat(
-            [checkpoint(run, index, use_reentrant=False, preserve_rng_state=False) for index in range(self.num_chunks)]
-        )
+        once = run
+        if self.num_chunks > 1 and torch.is_grad_enabled():
+            once = partial(checkpoint, run, use_reentrant=False, preserve_rng_state=False)
+        return torch.cat([once(index) for index in range(self.num_chunks)])

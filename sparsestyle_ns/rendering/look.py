@@ -8,37 +8,25 @@ from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.rendering.mixing import Mix
 
 RenderMode = Literal["exact", "baked"]
-RENDER_MODES: Tuple[RenderMode, ...] = ("exact", "baked")
 
 
 @dataclass(frozen=True)
 class Look:
-    """How pictures are made, and of what.
-
-    Attributes:
-        mode: exact or baked.
-        mix: how much of each field they show.
-        styles: the stylised fields, one or two, on the model's device; None: the model's own.
-    """
+    """How pictures are made, and of what."""
 
     mode: RenderMode
     mix: Mix
     styles: Optional[Tuple[StylisedField, ...]] = None
+    """One or two, on the model's device; None: the model's own."""
 
 
 class Display:
-    """The look of a model's pictures. The viewer's threads may see another one than everybody else.
-
-    Args:
-        own: the look that the run's config asks for.
-
-    Attributes:
-        viewer: gives the look of the viewer's pictures in the viewer's own threads, and None in all others.
-    """
+    """The look of a model's pictures, at first the one of the run's config; the viewer's threads may see another."""
 
     def __init__(self, own: Look) -> None:
         self.own = own
         self.viewer: Callable[[], Optional[Look]] = lambda: None
+        """Gives the look of the viewer's pictures in the viewer's own threads, and None in all others."""
 
     @property
     def look(self) -> Look:

@@ -6,9 +6,8 @@ strength s, geometry strength g and blend b of two styles, 0 and 1, shows
     σ = (1 − s g) σ_c + s g [(1 − b) σ_f⁰ + b σ_f¹],      c = (1 − s) c_c + s [(1 − b) c_f⁰ + b c_f¹].
 
 So strength 0 is the coarse field, strength and geometry strength 1 a stylised one, and geometry strength 0 a stylised
-colour on the coarse geometry. What a field of the kind of Eq. 3 adds to the density is σ_f − σ_c, the residual density
-as far as it takes effect; it is that, and not σ' itself, that s g weighs: a negative σ_c + s g σ' can't come up, and
-values that were worked out for one picture serve every other strength.
+colour on the coarse geometry. It is σ_f − σ_c, and not σ' itself, that s g weighs: so σ can't be negative, and values
+that were worked out for one picture serve every other strength.
 """
 
 from typing import NamedTuple, Sequence
@@ -18,13 +17,7 @@ from torch import Tensor
 
 
 class Mix(NamedTuple):
-    """How much of each field a picture shows; all in [0, 1].
-
-    Attributes:
-        strength: s, from the coarse field to a stylised one.
-        geometry: g, the share of the residual density that comes with the style.
-        blend: b, from the first style to the second; means nothing with one style.
-    """
+    """How much of each field a picture shows: s, g and b of the formulas above, all in [0, 1]."""
 
     strength: float = 1.0
     geometry: float = 1.0
@@ -60,6 +53,5 @@ def mixed(coarse: Appearance, styles: Sequence[Appearance], mix: Mix) -> Appeara
     if len(styles) > 1:
         density = interpolate(density, styles[1].density, mix.blend)
         color = interpolate(color, styles[1].color, mix.blend)
-    return Appearance(
-        interpolate(coarse.density, density, mix.density_share), interpolate(coarse.color, color, mix.strength)
-    )
+    density = interpolate(coarse.density, density, mix.density_share)
+    return Appearance(density, interpolate(coarse.color, color, mix.strength))

@@ -17,6 +17,8 @@ from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.rendering.mixing import STYLISED, Appearance, Mix, mixed
 from sparsestyle_ns.rendering.visible_samples import Marching, visible_samples
 
+Background = Optional[Float[Tensor, "3"]]
+"""The colour behind the scene; None where there is none, which shows as black."""
 POINTS_PER_CALL = 1 << 17
 """Points at which a frozen field is evaluated at once; bounds the memory of its hidden layers."""
 NO_WEIGHT = 1e-10
@@ -25,55 +27,41 @@ NO_WEIGHT = 1e-10
 
 @dataclass
 class PackedRender:
-    """Pixels.
-
-    Attributes:
-        rgb: colour, background included.
-        accumulation: Σw, the share of the ray that is not background.
-        s: where the ray's weight lies on average, in [0, 1]; 1 without weight.
-    """
+    """Pixels."""
 
     rgb: Float[Tensor, "rays 3"]
+    """Background included."""
     accumulation: Float[Tensor, "rays 1"]
+    """Σw, the share of the ray that is not background."""
     s: Float[Tensor, "rays 1"]
+    """Where the ray's weight lies on average, in [0, 1]; 1 without weight."""
 
 
 @dataclass
 class DenseRender(PackedRender):
-    """Pixels of the coarse field, with the samples that its losses are of.
-
-    Attributes:
-        weights: w of each sample.
-        density: σ of each sample.
-        positions: field coordinates of each sample.
-    """
+    """Pixels of the coarse field, with w, σ and the field coordinates of the samples that its losses are of."""
 
     weights: Float[Tensor, "rays samples"]
     density: Float[Tensor, "rays samples"]
     positions: Float[Tensor, "rays samples 3"]
 
 
-def seen_behind(
-    accumulation: Float[Tensor, "rays 1"], background: Optional[Float[Tensor, "3"]]
-) -> Float[Tensor, "rays 3"]:
+def seen_behind(accumulation: Float[Tensor, "rays 1"], background: Background) -> Float[Tensor, "rays 3"]:
     """The part of rays' colours that is background; 0 where there is none."""
     return torch.zeros_like(accumulation).expand(-1, 3) if background is None else (1.0 - accumulation) * background
 
 
 def over_background(
-    rgb: Float[Tensor, "rays 3"], accumulation: Float[Tensor, "rays 1"], background: Optional[Float[Tensor, "3"]]
+    rgb: Float[Tensor, "rays 3"], accumulation: Float[Tensor, "rays 1"], background: Background
 ) -> Float[Tensor, "rays 3"]:
     """Colour in front of a background colour; unchanged where there is none."""
     return rgb if background is None else rgb + (1.0 - accumulation) * background
 
 
 def straight_color(
-    rgb: Float[Tensor, "*batch 3"], accumulation: Float[Tensor, "*batch 1"], background: Optional[Float[Tensor, "3"]]
+    rgb: Float[Tensor, "*batch 3"], accumulation: Float[Tensor, "*batch 1"], background: Background
 ) -> Float[Tensor, "*batch 3"]:
-    """The scene's own colour, in [0, 1], from a render in front of a background: the inverse of `over_background`.
-
-    Black where a ray has no weight.
-    """
+    """The scene's own colour, in [0, 1]: the inverse of `over_background`, and black where a ray has no weight."""
     own = rgb if background is None else rgb - (1.0 - accumulation) * background
     color = torch.where(accumulation > NO_WEIGHT, own / accumulation.clamp(min=NO_WEIGHT), 0.0)
     return color.clamp(0.0, 1.0)
@@ -99,14 +87,10 @@ def render_coarse(
     directions: Float[Tensor, "rays 3"],
     edges: Float[Tensor, "rays edges"],
     unbounded: bool,
-    background: Optional[Float[Tensor, "3"]],
+    background: Background,
     thinning: Optional[Thinning] = None,
 ) -> DenseRender:
-    """Renders the coarse field with the samples that `edges` bound (Eq. 1; NeRF, Eq. 3).
-
-    Args:
-        thinning: of the field's backward pass; None: all samples are in it.
-    """
+    """Renders the coarse field with the samples that `edges` bound (Eq. 1; NeRF, Eq. 3)."""
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
     positions = segments.positions(middle)
     density, feature = field.density_and_feature(positions, thinning)
@@ -119,15 +103,7 @@ def render_coarse(
 
 @dataclass
 class FrozenSamples:
-    """All that the stylised field needs of a batch of rays and that training it doesn't change.
-
-    Attributes:
-        samples: where the samples are.
-        density: σ_c there.
-        feature: e_c there.
-        location: where they lie in the hash grid.
-        num_rays: of the batch.
-    """
+    """What the stylised field needs of a batch of rays and training doesn't change: samples, σ_c and e_c there."""
 
     samples: PackedSamples
     density: Float[Tensor, "samples"]
@@ -138,8 +114,7 @@ class FrozenSamples:
     @property
     def num_bytes(self) -> int:
         """Memory that keeping these samples takes."""
-        parts = [*self.samples, self.density, self.feature]
-        return sum(part.numel() * part.element_size() for part in parts) + self.location.num_bytes
+        return sum(part.nbytes for part in (*self.samples, self.density, self.feature)) + self.location.num_bytes
 
 
 @torch.no_grad()
@@ -147,7 +122,7 @@ def freeze_samples(
     field: CoarseField, stylised: StylisedField, segments: Segments, marching: Marching
 ) -> FrozenSamples:
     """Finds the samples of a batch of rays that can show, and evaluates the frozen coarse field there."""
-    samples, density, feature = visible_samples(field, segments, marching)
+    samples, density, feature = visible_samples(field.density_and_feature, segments, marching)
     return FrozenSamples(samples, density, feature, stylised.locate(samples.positions), len(segments.hit))
 
 
@@ -163,7 +138,7 @@ def render_packed(
     num_rays: int,
     density: Float[Tensor, "samples"],
     color: Float[Tensor, "samples 3"],
-    background: Optional[Float[Tensor, "3"]],
+    background: Background,
 ) -> PackedRender:
     """Composites packed samples of known density and colour; the packed twin of `render_coarse`."""
     weights = packed_weights(optical_depth(density, samples.lengths), samples.ray_indices, num_rays)[:, None]
@@ -171,22 +146,16 @@ def render_packed(
     return composite(packed_sum(weights * values, samples.ray_indices, num_rays), background)
 
 
-def composite(sums: Float[Tensor, "rays 5"], background: Optional[Float[Tensor, "3"]]) -> PackedRender:
+def composite(sums: Float[Tensor, "rays 5"], background: Background) -> PackedRender:
     """Pixels from a ray's sums of w times colour, of w, and of w times s."""
     rgb, accumulation, moment = sums.split([3, 1, 1], dim=-1)
     return PackedRender(over_background(rgb, accumulation, background), accumulation, _mean(moment, accumulation))
 
 
 def render_stylised(
-    stylised: StylisedField,
-    frozen: FrozenSamples,
-    background: Optional[Float[Tensor, "3"]],
-    coarse_geometry: bool = False,
+    stylised: StylisedField, frozen: FrozenSamples, background: Background, coarse_geometry: bool = False
 ) -> PackedRender:
-    """Renders σ_f and c_f (Eq. 2 and 3) at frozen samples; differentiable in the stylised field.
-
-    With `coarse_geometry`, σ_c takes the place of σ_f.
-    """
+    """Renders σ_f, or with `coarse_geometry` σ_c, and c_f (Eq. 2 and 3); differentiable in the stylised field."""
     density, color = stylised(frozen.location, frozen.feature, frozen.density)
     if coarse_geometry:
         density = frozen.density
@@ -199,15 +168,10 @@ def render_mixed(
     styles: Sequence[StylisedField],
     frozen: FrozenSamples,
     directions: Float[Tensor, "rays 3"],
-    background: Optional[Float[Tensor, "3"]],
+    background: Background,
     mix: Mix = STYLISED,
 ) -> Tuple[PackedRender, PackedRender]:
-    """The render of a mixture of the fields, by default the stylised one, and the coarse render, at frozen samples.
-
-    Args:
-        styles: one or two fields that give σ_f and c_f.
-        mix: how much of each field counts.
-    """
+    """The render of a mixture of the coarse field and of one or two styles, and the coarse one, at frozen samples."""
     coarse = Appearance(frozen.density, field.color(frozen.feature, directions[frozen.samples.ray_indices]))
     found = [Appearance(*style(frozen.location, frozen.feature, frozen.density)) for style in styles]
     render = render_packed(frozen.samples, frozen.num_rays, *mixed(coarse, found, mix), background)

@@ -1,10 +1,10 @@
 """The samples of rays that can show, found by marching through a frozen coarse field."""
 
 from dataclasses import dataclass
-from typing import List, Optional, Protocol, Tuple
+from typing import Callable, List, Optional, Tuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from sparsestyle_ns.core.occupancy import Occupancy, PackedSamples, march
@@ -17,73 +17,49 @@ SAMPLES_PER_PASS = 6
 
 @dataclass(frozen=True)
 class Marching:
-    """Where samples lie on a ray, and where it ends.
-
-    Attributes:
-        occupancy: which cells of the cube are empty and skipped; None: none.
-        num_steps: even steps along a ray.
-        unbounded: whether the last step goes on to infinity.
-        min_transmittance: share of light left, in [0, 1), at which a ray ends.
-    """
+    """Where samples lie on a ray, and where it ends."""
 
     occupancy: Optional[Occupancy]
+    """Which cells of the cube are empty and skipped; None: none."""
     num_steps: int
     unbounded: bool
+    """Whether the last step goes on to infinity."""
     min_transmittance: float
+    """Share of light left, in [0, 1), at which a ray ends."""
 
 
-class DensityField(Protocol):
-    """What marching asks of a field."""
-
-    def density_and_feature(
-        self, positions: Float[Tensor, "points 3"]
-    ) -> Tuple[Float[Tensor, "points"], Float[Tensor, "points feature"]]:
-        """σ_c and e_c at field coordinates."""
+DensityAndFeature = Callable[[Float[Tensor, "points 3"]], Tuple[Tensor, Tensor]]
+"""Gives σ_c and e_c at field coordinates."""
 
 
 def visible_samples(
-    field: DensityField, segments: Segments, marching: Marching
+    evaluate: DensityAndFeature, segments: Segments, marching: Marching
 ) -> Tuple[PackedSamples, Float[Tensor, "samples"], Float[Tensor, "samples feature"]]:
     """The samples of a batch of rays that can show, and σ_c and e_c there.
 
-    They lie in occupied cells, and more than `min_transmittance` of the light is left in front of them.
+    They lie in occupied cells, and more than `min_transmittance` of the light is left in front of them. The result is
+    the same each time, on a GPU too: a view that is frozen again in the backward pass must have the same samples. So no
+    depths are summed by atomic additions, as `index_add_` and long running sums do there.
     """
     samples = march(segments, marching.occupancy, marching.num_steps, marching.unbounded)
-    index, density, feature = evaluate_front_to_back(field, samples, len(segments.hit), marching.min_transmittance)
-    return samples.select(index), density, feature
-
-
-def evaluate_front_to_back(
-    field: DensityField, samples: PackedSamples, num_rays: int, min_transmittance: float
-) -> Tuple[Int[Tensor, "seen"], Float[Tensor, "seen"], Float[Tensor, "seen feature"]]:
-    """σ_c and e_c of those packed samples in front of which more than `min_transmittance` of the light is left.
-
-    A few samples of each ray are evaluated at a time, and none of a ray that has ended.
-
-    The result is the same each time, on a GPU too: a view that is frozen again in the backward pass must have the same
-    samples. So no depths are summed by atomic additions, as `index_add_` and long running sums do there.
-
-    Returns:
-        Which samples these are, ascending, and σ_c and e_c there.
-    """
-    on_ray = samples.ray_indices
+    on_ray, num_rays = samples.ray_indices, len(segments.hit)
     counts = torch.bincount(on_ray, minlength=num_rays)
     rank = torch.arange(len(on_ray), device=on_ray.device) - (torch.cumsum(counts, dim=0) - counts)[on_ray]
     depth = samples.s.new_zeros(num_rays)
     found: List[Tuple[Tensor, Tensor, Tensor]] = []
     for first in range(0, max(1, int(counts.max())), SAMPLES_PER_PASS):
-        goes_on = torch.exp(-depth) > min_transmittance
+        goes_on = torch.exp(-depth) > marching.min_transmittance
         in_pass = (rank >= first) & (rank < first + SAMPLES_PER_PASS) & goes_on[on_ray]
         index = in_pass.nonzero().squeeze(-1)
-        density, feature = field.density_and_feature(samples.positions[index])
+        density, feature = evaluate(samples.positions[index])
         place = on_ray[index], rank[index] - first
         depths = depth.new_zeros(num_rays, SAMPLES_PER_PASS)
         depths[place] = optical_depth(density, samples.lengths[index])
         behind = depth[:, None] + depths.cumsum(dim=1)
         in_front = torch.cat([depth[:, None], behind[:, :-1]], dim=1)
-        seen = torch.exp(-in_front)[place] > min_transmittance
+        seen = torch.exp(-in_front)[place] > marching.min_transmittance
         depth = behind[:, -1]
         found.append((index[seen], density[seen], feature[seen].float()))
     index, density, feature = (torch.cat(parts) for parts in zip(*found, strict=True))
     order = torch.argsort(index)
-    return index[order], density[order], feature[order]
+    return samples.select(index[order]), density[order], feature[order]

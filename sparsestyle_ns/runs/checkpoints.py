@@ -1,8 +1,4 @@
-"""Checkpoints: written whole and finite, found, and read.
-
-nerfstudio's layout: a run's folder nerfstudio_models has step-000000123.ckpt, with the iteration and the state of
-pipeline, optimisers and schedulers; here also notes on what made it.
-"""
+"""Checkpoints in nerfstudio's layout, with notes on what made them: written whole and finite, found, and read."""
 
 import re
 from pathlib import Path
@@ -51,11 +47,7 @@ def newest_checkpoint(folder: Path) -> Optional[Path]:
 
 
 def load_checkpoint(path: Path) -> Dict[str, Any]:
-    """What is in a checkpoint, with its tensors on the CPU.
-
-    Raises:
-        InputError: it can't be read.
-    """
+    """What is in a checkpoint, with its tensors on the CPU; InputError where it can't be read."""
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged archive can fail in many ways
@@ -75,18 +67,8 @@ def write_checkpoint(
     optimizers: Optimizers,
     notes: CheckpointNotes,
     scaler: Optional[GradScaler] = None,
-    unfinished: Optional[Path] = None,
 ) -> None:
-    """Writes a checkpoint that nerfstudio can load, whole or not at all.
-
-    Args:
-        path: of the checkpoint.
-        step: the last iteration that was done.
-        pipeline: its state.
-        optimizers: with their schedulers.
-        notes: what made it.
-        scaler: of gradients; None: one that is off.
-        unfinished: see `write_whole`; not in the folder of checkpoints, where nerfstudio takes every file for one.
+    """Writes a checkpoint of a pipeline's state after iteration `step` that nerfstudio can load, whole or not at all.
 
     Raises:
         InputError: a number in the state isn't finite.
@@ -108,4 +90,5 @@ def write_checkpoint(
     }
     # nerfstudio's exponential schedulers leave numpy's numbers, which torch refuses to load (`weights_only`).
     plain = tree_map_only(np.generic, lambda number: number.item(), state)
+    unfinished = path.parents[1] / "checkpoint.unfinished"  # nerfstudio takes every file beside `path` for a checkpoint
     write_whole(path, lambda file: torch.save(plain, file), unfinished)

@@ -11,11 +11,8 @@ from sparsestyle_ns.utils.errors import InputError
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
-COARSE_METHOD = "coarse-fewshot"
-"""What the names of stage 1's methods start with."""
-STYLE_METHOD = "hier-style"
-"""What the names of stage 2's methods start with."""
-
+COARSE_METHOD, STYLE_METHOD = "coarse-fewshot", "hier-style"
+"""What the names of stage 1's methods start with, and those of stage 2's."""
 REPORT_FILE = "evaluation.json"
 """What was measured of a run, in its folder."""
 
@@ -23,12 +20,7 @@ REPORT_FILE = "evaluation.json"
 def find_config(run: Path, method: str = "") -> Path:
     """The config.yml of a run, given by its folder or by that file; reads no more than its method's name.
 
-    Args:
-        run: the folder or the file.
-        method: what the name of the run's method starts with; empty for either method of this package.
-
-    Raises:
-        InputError: it isn't there, or is a run of another method.
+    InputError where it isn't there, or that name doesn't start with `method`; empty: either method of this package.
     """
     path = run if run.name == "config.yml" else run / "config.yml"
     if not path.is_file():
@@ -45,11 +37,7 @@ def find_config(run: Path, method: str = "") -> Path:
 
 
 def read_config(folder: Path) -> "TrainerConfig":
-    """What is in the config.yml of a run's folder.
-
-    Raises:
-        InputError: it can't be read.
-    """
+    """What is in the config.yml of a run's folder; InputError where it can't be read."""
     path = folder / "config.yml"
     try:
         return yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)

@@ -1,4 +1,4 @@
-"""What a run was trained on, saved beside its config, so that a later run can tell whether it fits."""
+"""What a run was trained on, its photos and its painting, saved beside its config for later runs and viewers."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -12,10 +12,12 @@ from sparsestyle_ns.data.scene_info import scene_info
 from sparsestyle_ns.effects.background import background_color
 from sparsestyle_ns.effects.base import Decisions
 from sparsestyle_ns.effects.registry import decided_on_photos
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 
-FILE_NAME = "scene.json"
+RECORD_FILE = "scene.json"
+THUMBNAIL_FILE = "style_thumbnail.jpg"
 
 
 @dataclass
@@ -36,16 +38,12 @@ class SceneRecord:
 
     def save(self, folder: Path) -> None:
         """Writes `scene.json` into a run's folder."""
-        write_whole(folder / FILE_NAME, json.dumps(asdict(self), indent=1) + "\n")
+        write_whole(folder / RECORD_FILE, json.dumps(asdict(self), indent=1) + "\n")
 
     @classmethod
     def load(cls, folder: Path) -> "SceneRecord":
-        """Reads `scene.json` of a run's folder.
-
-        Raises:
-            InputError: there is none, or it can't be read.
-        """
-        path = folder / FILE_NAME
+        """Reads `scene.json` of a run's folder; InputError where it can't be read."""
+        path = folder / RECORD_FILE
         try:
             return cls(**json.loads(path.read_text()))
         except (OSError, ValueError, TypeError) as error:
@@ -58,9 +56,8 @@ class SceneRecord:
         for name, on in self.effects.items():
             theirs = other.effects.get(name, False)
             if on != theirs:
-                word = "on" if theirs else "off"
-                flag = f"--pipeline.effects.{name.replace('_', '-')} {word}"
-                return f"it was made with the effect {name} {word}, as by {flag}"
+                word, flag = "on" if theirs else "off", f"--pipeline.effects.{name.replace('_', '-')}"
+                return f"it was made with the effect {name} {word}, as by {flag} {word}"
         if self.background_color != other.background_color:
             return f"its background has the colour {other.background_color} in place of {self.background_color}"
         mine, theirs = [*self.cameras, self.scene_box], [*other.cameras, other.scene_box]
@@ -81,3 +78,17 @@ def record_scene(data: Path, outputs: DataparserOutputs, effects: Decisions) -> 
         background_color=None if background is None else background.tolist(),
         effects=decided_on_photos(effects),
     )
+
+
+def save_thumbnail(folder: Path, painting: Painting) -> None:
+    """Keeps a painting's thumbnail in a run's folder, so that the run can be told apart without the painting."""
+    write_whole(folder / THUMBNAIL_FILE, painting.thumbnail())
+
+
+def find_thumbnail(folder: Path, style_image: Optional[Path]) -> Optional[bytes]:
+    """The thumbnail of a run's painting: the run's own, else made from the painting; None where neither is there."""
+    kept = folder / THUMBNAIL_FILE
+    try:
+        return kept.read_bytes() if kept.is_file() or style_image is None else Painting.read(style_image).thumbnail()
+    except (OSError, InputError):
+        return None

@@ -8,7 +8,7 @@ from typing import Dict, List, Mapping, Sequence, Tuple
 from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.engine.previews import preview_path
-from sparsestyle_ns.evaluation.tables import COARSE_QUALITY, STYLE_AND_CONTENT, Table, consistency_columns, table_of
+from sparsestyle_ns.evaluation.tables import COARSE_QUALITY, CONSISTENCY, STYLE_AND_CONTENT, Table, table_of
 from sparsestyle_ns.metrics.art_fid import why_left_out
 from sparsestyle_ns.runs.scene_record import SceneRecord
 from sparsestyle_ns.studies.baselines import can_transfer, smooth_along_flow, transfer_frames
@@ -195,7 +195,7 @@ def consistency_table(measured: Mapping[str, RunFigures], with_paper: bool) -> T
     paper = PAPER_ROWS if with_paper else {}
     cited = {f"the paper's {name}": dict(zip(PAPER_KEYS, values, strict=True)) for name, values in paper.items()}
     title, note = "Consistency between frames t and t + 1 (short), t and t + 7 (long)", PAPER_NOTE if with_paper else ""
-    table = table_of(title, consistency_columns(), [*rows.items(), *cited.items()], note)
+    table = table_of(title, CONSISTENCY, [*rows.items(), *cited.items()], note)
     table.cited = tuple(cited)
     return table
 

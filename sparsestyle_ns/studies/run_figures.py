@@ -15,8 +15,7 @@ from torchvision.utils import save_image
 
 from sparsestyle_ns.core.camera_paths import measuring_path
 from sparsestyle_ns.engine.loading import evaluate_run, load_run
-from sparsestyle_ns.evaluation.held_out import saved_report, stylisation_figures
-from sparsestyle_ns.evaluation.path_frames import PathFrames, render_path
+from sparsestyle_ns.evaluation.held_out import PathFrames, render_path, saved_report, stylisation_figures
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID, missing_weights
 from sparsestyle_ns.metrics.image import gram_matrix, has_lpips, image_metrics
@@ -59,7 +58,7 @@ class PaintingMeasure:
         """Means over some frames of style strength and content kept, and their ArtFID; by a run's network and sizes."""
         if self._targets is None:
             settings = replace(settings, style_image=self.painting)
-            self._targets = settings.targets_of(settings.load_style(), torch.device("cpu"))
+            self._targets = settings.targets_of(*settings.load_style(), torch.device("cpu"))
         values, art_fid, gram = [], ArtFID.against(self._targets.style_image), gram_matrix(self._targets.style_rows())
         for index in track(range(0, len(frames.stylised), STYLE_EVERY), "Style and content"):
             stylised, coarse = frames.stylised[index], frames.coarse[index]

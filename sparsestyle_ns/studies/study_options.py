@@ -6,11 +6,13 @@ from typing import Annotated, List, Literal, Optional, Tuple
 
 import tyro
 
+from sparsestyle_ns.utils.errors import CommandOptions
+
 Group = Literal["quadrature", "training", "fine-field", "style", "rendering", "precision"]
 
 
 @dataclass
-class StudyOptions:
+class StudyOptions(CommandOptions):
     """What `compare` and `ablate` are run on."""
 
     data: Path
@@ -52,8 +54,33 @@ class StudyOptions:
 
 
 @dataclass
-class TradeoffOptions:
-    """What `tradeoff` is run on."""
+class CompareOptions(StudyOptions):
+    """Runs the paper's comparison on a scene: baselines and ours, in one table and one grid beside the paper's rows.
+
+    Rows: frame-by-frame 2D transfer of the coarse renders (needs `pip install -e .[compare]`), the same smoothed along
+    the optical flow, fine-tuning the coarse field (ARF's kind), a FreeNeRF-style field fine-tuned, and ours.
+    Interrupted, the same command goes on where it was.
+    """
+
+
+@dataclass
+class AblateOptions(StudyOptions):
+    """Runs the paper's ablations on a scene, and sets them out on one page.
+
+    Stage 1 as ours, as the paper writes it, as vanilla NeRF, with a semantic loss of DietNeRF's kind and with
+    FreeNeRF's regularisers, each with our stage 2 and fine-tuned; stage 2 on e_c alone, with sines and cosines,
+    without residual density, with constant content weights.
+    Interrupted, the same command goes on where it was; runs that `compare` has made are used.
+    """
+
+
+@dataclass
+class TradeoffOptions(CommandOptions):
+    """Measures what accuracy costs in time, on this machine and a scene of yours.
+
+    Writes curves of error against time for each setting that trades one for the other, as a page that opens offline,
+    JSON and CSV, and says in plain words what to turn. Ctrl-C keeps what has been measured.
+    """
 
     data: Path
     """The scene, as for ns-train."""

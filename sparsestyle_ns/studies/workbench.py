@@ -136,7 +136,7 @@ class Workbench:
         """The painting's features with a run's settings, worked out once."""
         key = config.feature_side, config.style_side, config.style_features
         if key not in self._targets:
-            self._targets[key] = config.targets_of(config.load_style(), self.device)
+            self._targets[key] = config.targets_of(*config.load_style(), self.device)
         return self._targets[key]
 
     def _setup_pipeline(self, config: SparseStyleTrainerConfig) -> CheckedPipeline:

@@ -11,6 +11,17 @@ class InputError(ValueError):
     """Something the user gave cannot be used. The message is one sentence: what is wrong, where, and what to do."""
 
 
+class CommandOptions:
+    """The options of a `sparsestyle` command, a dataclass whose docstrings are the command's help."""
+
+    def check(self) -> None:
+        """Finds what can't be used before torch is loaded, which takes seconds.
+
+        Raises:
+            InputError: an option can't be used.
+        """
+
+
 def exit_on_input_error(function: Callable[P, R]) -> Callable[P, R]:
     """Has `function`, a boundary to the command line, end the process on an `InputError`: its message, and status 1."""
 

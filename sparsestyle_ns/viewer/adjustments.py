@@ -13,8 +13,7 @@ def begin_at_central_photo(viewer: Viewer, cameras: Cameras) -> None:
     """Has each new browser look at the scene as its most central photo does."""
     poses = cameras.camera_to_worlds.cpu().double().numpy()
     centre = int(np.argmin(np.linalg.norm(poses[:, :, 3] - poses[:, :, 3].mean(axis=0), axis=-1)))
-    pose = poses[centre]
-    position = VISER_NERFSTUDIO_SCALE_RATIO * pose[:, 3]
+    pose, position = poses[centre], VISER_NERFSTUDIO_SCALE_RATIO * poses[centre, :, 3]
 
     def welcome(client: ClientHandle) -> None:
         with client.atomic():
@@ -39,10 +38,7 @@ def hide_frustums(viewer: Viewer) -> None:
 
 
 def keep_outputs(viewer: Viewer, outputs: List[str], choose: Callable[[], None]) -> None:
-    """Offers a model's outputs, and has `choose` pick from them again whenever nerfstudio fills its lists.
-
-    nerfstudio does that for each browser that comes, and forgets what was chosen.
-    """
+    """Offers a model's outputs, and has `choose` pick again when nerfstudio offers its own, as for each new browser."""
     control_panel = viewer.control_panel
     fill = control_panel.update_output_options
 

@@ -1,17 +1,15 @@
 """Baked volumes filled ahead, on a CPU: what cameras near the photos see is there when they come.
 
-A camera that sees a place for the first time waits for the fields to be evaluated there, most of a second on two cores;
-one that sees it again doesn't. So the time in which nobody moves anything goes to places that are likely to be seen.
+A camera that sees a place for the first time waits for the fields to be evaluated there, most of a second on two cores.
 """
 
 import threading
 import time
 from contextlib import AbstractContextManager
-from typing import Callable, Iterator, List, Optional, Set, Tuple
+from typing import Callable, List, Optional, Set, Tuple
 from weakref import WeakKeyDictionary
 
 import torch
-from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
@@ -39,14 +37,9 @@ def likely_cameras(cameras: Cameras) -> List[Cameras]:
 
 
 class Baker(threading.Thread):
-    """Fills the volumes of the styles that are shown, for as long as there is something to fill and time for it.
+    """Fills the volumes of the styles that are shown, while there is something to fill and the processor is free.
 
-    Args:
-        model: whose volumes these are.
-        cameras: of the photos.
-        shown: the styles on the screen.
-        is_free: whether the processor has nothing else to do.
-        lock: that the viewer's pictures are made under.
+    `cameras` are those of the photos; `lock` is the one that the viewer's pictures are made under.
     """
 
     def __init__(
@@ -60,13 +53,12 @@ class Baker(threading.Thread):
         super().__init__(name="baking", daemon=True)
         self.model, self.shown, self.is_free, self.lock = model, shown, is_free, lock
         self.cameras = likely_cameras(cameras)
+        # The cameras whose rays have all been followed in a volume, for as long as the model keeps that.
         self.filled: WeakKeyDictionary[BakedVolume, Set[int]] = WeakKeyDictionary()
-        """The cameras whose rays have all been followed in a volume, for as long as the model keeps that."""
         self.ending = threading.Event()
-        """Ends it."""
 
     def run(self) -> None:
-        """Works until it is to end."""
+        """Works until `ending` is set."""
         while not self.ending.is_set():
             task = self._next() if self.is_free() else None
             if task is None:
@@ -80,19 +72,18 @@ class Baker(threading.Thread):
 
     def _next(self) -> Optional[Tuple[StylisedField, int]]:
         """A style on the screen, and the number of a camera that its volume isn't filled for."""
-        filled = [(style, self._filled_for(style)) for style in self.shown()]
+        volumes = [(style, self.model.baked.kept(style)) for style in self.shown()]
+        filled = [(style, set() if volume is None else self.filled.get(volume, set())) for style, volume in volumes]
         numbers = range(len(self.cameras))
         return next(((style, number) for number in numbers for style, known in filled if number not in known), None)
-
-    def _filled_for(self, style: StylisedField) -> Set[int]:
-        volume = self.model.baked.kept(style)
-        return set() if volume is None else self.filled.get(volume, set())
 
     def _fill(self, style: StylisedField, number: int) -> None:
         """Follows a camera's rays, as long as the style is shown and its volume stays the same."""
         followed: Optional[BakedVolume] = None
-        for rays in _rays(self.cameras[number], self.model.device):
-            volume = self._follow(style, *rays)
+        bundle = self.cameras[number].to(self.model.device).generate_rays(camera_indices=0, keep_shape=False).flatten()
+        parts = bundle.origins.split(RAYS_AT_ONCE), bundle.directions.split(RAYS_AT_ONCE)
+        for origins, directions in zip(*parts, strict=True):
+            volume = self._follow(style, origins, directions)
             if volume is None or followed not in (None, volume):
                 return
             followed = volume
@@ -100,19 +91,14 @@ class Baker(threading.Thread):
 
     @torch.no_grad()
     def _follow(self, style: StylisedField, origins: Tensor, directions: Tensor) -> Optional[BakedVolume]:
-        """Fills what these rays meet, once there is time, and returns in which volume; None where the style isn't
-        shown any more, or it is to end."""
+        """Fills what these rays meet, once there is time; None instead of the volume where that has become useless."""
         while not self.is_free() and not self.ending.wait(0.1):
             pass
         if self.ending.is_set() or style not in self.shown():
             return None
         with self.lock:
-            self.model.render_baked(self.model.space.segments(origins, directions), (style,))
+            model, segments = self.model, self.model.space.segments(origins, directions)
+            model.baked.render((style,), segments, model.marching, model.background)
             volume = self.model.baked.kept(style)
         time.sleep(0.005)  # whoever waits for the lock gets it
         return volume
-
-
-def _rays(camera: Cameras, device: torch.device) -> Iterator[Tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]]:
-    bundle = camera.to(device).generate_rays(camera_indices=0, keep_shape=False).flatten()
-    return zip(bundle.origins.split(RAYS_AT_ONCE), bundle.directions.split(RAYS_AT_ONCE), strict=True)

@@ -1,11 +1,11 @@
-"""The "Style" panel of `hier-style` in nerfstudio's viewer, in ns-train and ns-viewer alike."""
+"""Our part of nerfstudio's viewer: a panel of the style for `hier-style`, and of the effects for both methods."""
 
 import atexit
 import threading
 import time
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import List, Optional, Tuple
+from typing import List, Optional, Tuple, get_args
 
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
@@ -15,18 +15,17 @@ from nerfstudio.viewer.viewer_elements import ViewerControl
 from sparsestyle_ns.engine.restyling import Workshop
 from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.losses.stylization import Losses
+from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
-from sparsestyle_ns.rendering.look import RENDER_MODES, Look
+from sparsestyle_ns.rendering.look import Look, RenderMode
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes
-from sparsestyle_ns.runs.thumbnail import find_thumbnail
+from sparsestyle_ns.runs.scene_record import find_thumbnail
 from sparsestyle_ns.utils.files import free_name
 from sparsestyle_ns.viewer.adjustments import begin_at_central_photo, hide_frustums, keep_outputs
 from sparsestyle_ns.viewer.baking import Baker
-from sparsestyle_ns.viewer.effects_panel import add_effects
-from sparsestyle_ns.viewer.restyling_controls import Pace, RestylingControls
-from sparsestyle_ns.viewer.styles import Facts, Style, saved_notes, style_facts
-from sparsestyle_ns.viewer.texts import losses_text
+from sparsestyle_ns.viewer.restyling_controls import Pace, RestylingControls, losses_text
+from sparsestyle_ns.viewer.styles import Facts, Style, plain, saved_notes, style_facts
 
 NO_BLEND = "nothing"
 """What a style is blended with at first; no style has this name."""
@@ -43,25 +42,17 @@ MAX_SIDE_ON_CPU = 256
 class StylePanel(ViewerControl):
     """Controls of the style, in a folder of their own; they are made when a viewer is.
 
-    Controls change what the viewer's threads draw and nothing else: what is drawn in training and for evaluation, files
-    and videos is what the run's config says.
-
-    Args:
-        pipeline: of the run.
+    Controls change what the viewer's threads draw and nothing else: all other pictures are as the run's config says.
     """
 
     def __init__(self, pipeline: HierStylePipeline) -> None:
         self.pipeline = pipeline
-        self.styles: List[Style] = []
         self.baker: Optional[Baker] = None
         self._last_change = 0.0
         self._pace = Pace()
         self._knows_training = False
 
-    # Making the panel
-
     def _setup(self, viewer: Viewer) -> None:
-        """Called by nerfstudio when everything else of the viewer is there; see `ViewerControl`."""
         super()._setup(viewer)
         self.folder = Path(viewer.log_filename).parent.resolve()
         self._name_own_style()
@@ -93,12 +84,12 @@ class StylePanel(ViewerControl):
         self.other = gui.add_dropdown("Blend with", [NO_BLEND, *names])
         self.blend = gui.add_slider("Blend", 0.0, 1.0, 0.01, 0.5, visible=False, hint="0: the style, 1: the other one")
         hint = "baked: quick from a voxel grid, once it has seen a place"
-        self.mode = gui.add_dropdown("Render mode", RENDER_MODES, mode, hint=hint)
+        self.mode = gui.add_dropdown("Render mode", get_args(RenderMode), mode, hint=hint)
         self.split = gui.add_checkbox("Coarse | stylised", False)
         for control in (self.strength, self.geometry, self.blend, self.mode):
             control.on_update(lambda _: self._changed())
-        self.style.on_update(lambda _: self._style_chosen())
-        self.other.on_update(lambda _: self._other_chosen())
+        for control in (self.style, self.other):
+            control.on_update(lambda _: self._style_chosen())
         self.split.on_update(lambda _: self.apply_split())
         self.training = gui.add_markdown("", image_root=Path(), visible=False)
         self.restyling = RestylingControls(
@@ -131,12 +122,10 @@ class StylePanel(ViewerControl):
         """The lock that iterations of training and the viewer's pictures take turns by."""
         return nullcontext() if self.viewer.train_lock is None else self.viewer.train_lock
 
-    # Styles
-
     def _name_own_style(self) -> None:
         painting = self.pipeline.config.style_image
-        name = self._free_name("this run" if painting is None else painting.stem)
-        self.styles = [Style(name, self.pipeline.model.residual)]
+        name = free_name("this run" if painting is None else painting.stem, [NO_BLEND])
+        self.styles: List[Style] = [Style(name, self.pipeline.model.residual)]
 
     def describe_run(self) -> None:
         """Says what made the run's own style, as far as it is known by now."""
@@ -153,7 +142,7 @@ class StylePanel(ViewerControl):
 
     def add_style(self, name: str, field: StylisedField, facts: Facts, thumbnail: bytes) -> str:
         """Adds a style and chooses it; returns its name, which may have got a number to tell it from the others."""
-        name = self._free_name(name)
+        name = free_name(name, [NO_BLEND, *(style.name for style in self.styles)])
         with self._lock():
             self.styles.append(Style(name, field, facts, thumbnail))
         self.offer_styles(name)
@@ -161,14 +150,9 @@ class StylePanel(ViewerControl):
 
     def offer_styles(self, chosen: str) -> None:
         """Fills the lists with the styles that there are, and chooses one by its name."""
-        names = [style.name for style in self.styles]
-        self.style.options = names
-        self.other.options = [NO_BLEND, *names]
+        self.style.options = [style.name for style in self.styles]
+        self.other.options = [NO_BLEND, *self.style.options]
         self.style.value = chosen
-
-    def _free_name(self, name: str) -> str:
-        """A name by which a new style can be told from the others and from none."""
-        return free_name(name, [NO_BLEND, *(style.name for style in self.styles)])
 
     def _named(self, name: str) -> Optional[Style]:
         return next((style for style in self.styles if style.name == name), None)
@@ -176,14 +160,11 @@ class StylePanel(ViewerControl):
     def _chosen(self) -> Style:
         return self._named(self.style.value) or self.styles[0]
 
-    # What is drawn
-
     def look(self) -> Optional[Look]:
         """What the controls say, to the viewer's own threads; None to all others."""
         if not isinstance(threading.current_thread(), RenderStateMachine):
             return None
-        mix = Mix(self.strength.value, self.geometry.value, self.blend.value)
-        return Look(self.mode.value, mix, self.shown())
+        return Look(self.mode.value, Mix(self.strength.value, self.geometry.value, self.blend.value), self.shown())
 
     def shown(self) -> Tuple[StylisedField, ...]:
         """The fields of the style and of the one that it is blended with."""
@@ -196,20 +177,16 @@ class StylePanel(ViewerControl):
 
     def _style_chosen(self) -> None:
         self.description.content = self._chosen().markdown()
-        self._changed()
-
-    def _other_chosen(self) -> None:
         self.blend.visible = self.other.value != NO_BLEND
         self._changed()
 
     def apply_split(self) -> None:
         """Shows the coarse field on the left and the stylised one on the right, or the stylised one alone."""
         panel = self.viewer.control_panel
-        outputs = ("rgb_coarse", "rgb") if self.split.value else ("rgb", "rgb_coarse")
+        left, right = ("rgb_coarse", "rgb") if self.split.value else ("rgb", "rgb_coarse")
         if self.split.value or panel._split.value:
-            panel._output_render.value, panel._split_output_render.value = outputs
-        else:
-            panel._split_output_render.value = outputs[1]
+            panel._output_render.value = left
+        panel._split_output_render.value = right
         panel._split.value = self.split.value
 
     def seconds_at_rest(self) -> float:
@@ -217,13 +194,11 @@ class StylePanel(ViewerControl):
         return min(time.time() - self.viewer.last_move_time, time.monotonic() - self._last_change)
 
     def _is_free(self) -> bool:
-        """Whether volumes may be filled ahead."""
+        if self.mode.value != "baked" or self.restyling.is_busy:
+            return False
         trainer = self.viewer.trainer
-        trains = trainer is not None and trainer.training_state != "completed"
-        idle = not self.restyling.is_busy and self.seconds_at_rest() > SECONDS_UNTIL_BAKING
-        return self.mode.value == "baked" and idle and not trains
-
-    # Training
+        is_over = trainer is None or trainer.training_state == "completed"
+        return is_over and self.seconds_at_rest() > SECONDS_UNTIL_BAKING
 
     def show_losses(self, step: int, losses: Losses) -> None:
         """Tells of an iteration of training."""
@@ -231,8 +206,30 @@ class StylePanel(ViewerControl):
         if not self._pace.is_due(at_once=step + 1 == total):
             return
         if not self._knows_training:
-            self._knows_training = True
+            self._knows_training = self.training.visible = True
             self.describe_run()
-            self.training.visible = True
         values = {name: float(value) for name, value in losses.metrics().items()}
         self.training.content = f"Iteration {step + 1} of {total}: {losses_text(values)}"
+
+
+def add_effects(viewer: Viewer, pipeline: CheckedPipeline) -> None:
+    """Adds a folder that says which effects of a scene are simulated, and why."""
+    lines = [  # a table would be wider than the panel
+        f"**{plain(name)}** {state}: {measured} {plain(why)} (threshold {threshold})"
+        for name, state, measured, threshold, why in (item.cells() for item in pipeline.effects.items)
+    ]
+    gui = viewer.viser_server.gui
+    with gui.add_folder("Effects of this scene", expand_by_default=False):
+        # viser warns where it is given no folder of pictures; there are none here.
+        gui.add_markdown("\n\n".join(lines), image_root=Path())
+
+
+class EffectsPanel(ViewerControl):
+    """The effects of a scene, in a folder of their own."""
+
+    def __init__(self, pipeline: CheckedPipeline) -> None:
+        self.pipeline = pipeline
+
+    def _setup(self, viewer: Viewer) -> None:
+        super()._setup(viewer)
+        add_effects(viewer, self.pipeline)

@@ -4,7 +4,7 @@ import math
 import threading
 import time
 from pathlib import Path
-from typing import Callable, Optional
+from typing import Callable, Dict, Optional
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -12,10 +12,11 @@ from viser import GuiApi
 
 from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
 from sparsestyle_ns.fields.fine import StylisedField
+from sparsestyle_ns.runs.run_folder import read_config
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.viewer.styles import Facts, style_facts
-from sparsestyle_ns.viewer.texts import error_text, in_one_line, losses_text, minutes, plain
+from sparsestyle_ns.utils.progress import duration
+from sparsestyle_ns.viewer.styles import Facts, plain, style_facts
 
 SECONDS_BETWEEN_TEXTS = 0.5
 """Losses and progress are not told more often than this."""
@@ -24,6 +25,24 @@ SECONDS_AT_REST = 0.3
 
 AddStyle = Callable[[str, StylisedField, Facts, bytes], str]
 """Shows a new style, given a name, its field, what made it and its thumbnail; returns the name that it got."""
+
+
+def losses_text(losses: Dict[str, float]) -> str:
+    """Losses and weights by name, in a line."""
+    return ", ".join(f"{name} {value:.3g}" for name, value in losses.items())
+
+
+def error_text(error: Exception) -> str:
+    """An error in one sentence; one that isn't about the user's input keeps its kind."""
+    text = in_one_line(error)
+    if isinstance(error, InputError):
+        return text
+    return f"Something went wrong in restyling, and the style on the screen stays ({type(error).__name__}: {text})."
+
+
+def in_one_line(error: Exception) -> str:
+    """An error's message without line breaks, or its kind where it has none."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 class Pace:
@@ -44,12 +63,8 @@ class Pace:
 class RestylingControls:
     """An image, buttons and a progress bar; one restyling at a time, in a thread of its own.
 
-    Args:
-        gui: where the controls are added, in the folder that is open.
-        open_workshop: the scene's workshop, or an `InputError` that says why it can't be restyled.
-        is_prepared: whether the scene is ready, which it isn't while training is being set up.
-        seconds_at_rest: since a camera or a control was moved.
-        add_style: shows a new style.
+    `open_workshop` raises an `InputError` that says why a scene can't be restyled. `is_prepared` is false while a
+    training is being set up; `seconds_at_rest` count since a camera or a control was moved.
     """
 
     def __init__(
@@ -67,7 +82,7 @@ class RestylingControls:
         iterations, said = 0, ""
         try:
             self.workshop = open_workshop()
-            iterations = self.workshop.config().max_num_iterations
+            iterations = read_config(self.workshop.folder).max_num_iterations
         except InputError as error:
             said = f"**No restyling.** {plain(str(error))}"
         with gui.add_folder("Another style", expand_by_default=False):
@@ -92,25 +107,30 @@ class RestylingControls:
 
     def restyle_path(self) -> None:
         """Restyles with the picture whose path was written."""
-        self._restyle(self._read_path)
+
+        def read() -> Painting:
+            path = self.path.value.strip()
+            if not path:
+                raise InputError("There is no image: write a path, or upload one.")
+            return Painting.read(path)
+
+        self._restyle(read)
 
     def restyle_upload(self, name: str, data: bytes) -> None:
         """Restyles with a picture that a browser sent."""
         self._restyle(lambda: Painting.received(name, data))
 
-    def _read_path(self) -> Painting:
-        path = self.path.value.strip()
-        if not path:
-            raise InputError("There is no image: write a path, or upload one.")
-        return Painting.read(path)
-
     def _restyle(self, read: Callable[[], Painting]) -> None:
-        """Starts a restyling, or says why not."""
         if not self._busy.acquire(blocking=False):
             self.message.content = "One restyling at a time: wait for it, or stop it."
             return
         try:
-            restyling = self._new_restyling(read())
+            painting = read()
+            if self.workshop is None:
+                raise InputError("This run can't be restyled in this viewer.")
+            if not self.is_prepared():
+                raise InputError("The scene is still being prepared for training; try again when it has begun.")
+            restyling = Restyling(self.workshop, painting, int(self.iterations.value))
         except Exception as error:  # whatever it is, the viewer goes on
             self._busy.release()
             self.end(f"**Not restyled.** {plain(error_text(error))}")
@@ -120,15 +140,7 @@ class RestylingControls:
         self.thread = threading.Thread(target=self._work, args=(restyling,), name="restyling", daemon=True)
         self.thread.start()
 
-    def _new_restyling(self, painting: Painting) -> Restyling:
-        if self.workshop is None:
-            raise InputError("This run can't be restyled in this viewer.")
-        if not self.is_prepared():
-            raise InputError("The scene is still being prepared for training; try again when it has begun.")
-        return Restyling(self.workshop, painting, int(self.iterations.value))
-
     def _work(self, restyling: Restyling) -> None:
-        """Stylises, then shows what came out; the thread of one restyling."""
         try:
             with torch.enable_grad():
                 for progress in restyling:
@@ -175,7 +187,7 @@ class RestylingControls:
         self.bar.visible, self.bar.value = True, 100.0 * progress.done
         text = f"Restyling. {progress.words}"
         if progress.losses is not None:
-            text += f": {losses_text(progress.losses)}, {minutes(progress.seconds_left)} left"
+            text += f": {losses_text(progress.losses)}, {duration(progress.seconds_left)} left"
         self.message.content = text
 
     def end(self, message: str) -> None:

@@ -1,6 +1,6 @@
 """The styles of a scene that a viewer can show: fields, their paintings, and what made them."""
 
-import base64
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import List, Optional, Tuple
@@ -8,45 +8,41 @@ from typing import List, Optional, Tuple
 from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, load_checkpoint, newest_checkpoint
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.viewer.texts import plain
+from sparsestyle_ns.utils.page import bytes_uri
 
 Facts = List[Tuple[str, str]]
 """What made a style: pairs of what it is called and what it is."""
 
 
+def plain(text: str) -> str:
+    """Text that Markdown shows as it is, and that may be broken behind slashes and underscores.
+
+    viser's Markdown takes JSX; a panel with a path in it that doesn't fit would have to be scrolled sideways.
+    """
+    escaped = re.sub(r"([\\`*_{}\[\]<>()#+!|~$&])", r"\\\1", " ".join(text.split()))
+    return re.sub(r"(/|\\_)", r"\1<wbr />", escaped)
+
+
 @dataclass(eq=False)
 class Style:
-    """One style of the scene.
-
-    Attributes:
-        name: what the panel calls it.
-        field: gives σ_f and c_f.
-        facts: what made it.
-        thumbnail: a small JPEG of its painting.
-    """
+    """One style of the scene."""
 
     name: str
     field: StylisedField
     facts: Facts = field(default_factory=list)
     thumbnail: Optional[bytes] = None
+    """A small JPEG of its painting."""
 
     def markdown(self) -> str:
         """The thumbnail, and what made the style."""
-        picture = []
+        lines = [f"**{name}** {plain(value)}" for name, value in self.facts]
         if self.thumbnail is not None:
-            picture = [f"![painting](data:image/jpeg;base64,{base64.b64encode(self.thumbnail).decode()})"]
-        return "\n\n".join([*picture, *(f"**{name}** {plain(value)}" for name, value in self.facts)])
+            lines.insert(0, f"![painting]({bytes_uri(self.thumbnail, 'image/jpeg')})")
+        return "\n\n".join(lines)
 
 
 def style_facts(painting: Optional[str], run: str, notes: CheckpointNotes, iterations: Optional[int] = None) -> Facts:
-    """What made a style.
-
-    Args:
-        painting: its file's name.
-        run: the run's folder, or why there is none.
-        notes: of its checkpoint, or of its trainer.
-        iterations: how many it has behind it; None: not known yet.
-    """
+    """What made a style: its painting's file name, the run's folder, and notes of its checkpoint or of its trainer."""
     facts = [("Painting", painting or "not known"), ("Run", run)]
     if iterations is not None:
         facts.append(("Iterations", str(iterations)))

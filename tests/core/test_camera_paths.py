@@ -6,13 +6,7 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
-from sparsestyle_ns.core.camera_paths import (
-    ARC_STEP,
-    NUM_FRAMES,
-    at_poses,
-    measuring_path,
-    unseen_places,
-)
+from sparsestyle_ns.core.camera_paths import ARC_STEP, NUM_FRAMES, at_poses, measuring_path, unseen_places
 from sparsestyle_ns.utils.errors import InputError
 
 

@@ -10,13 +10,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 from make_sample_scene import main
-from sample_scene.cameras import (
-    circling_cameras,
-    forward_facing_cameras,
-    look_at,
-    rays_of_rows,
-    surrounding_cameras,
-)
+from sample_scene.cameras import circling_cameras, forward_facing_cameras, look_at, rays_of_rows, surrounding_cameras
 from sample_scene.scene import Scene, objects_on_a_plinth, still_life
 from sample_scene.shapes import Box, Sphere
 from sample_scene.textures import ValueNoise

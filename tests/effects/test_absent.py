@@ -160,10 +160,7 @@ def test_without_lens_distortion_no_ray_is_undistorted(tmp_path: Path):
     make_sample_scene.main([str(tmp_path / "straight"), *options])
 
     def operations(name: str, choice: str) -> Counter:
-        config = FewShotDataManagerConfig(
-            data=tmp_path / name / "nerfstudio",
-            dataparser=NerfstudioDataParserConfig(),
-        )
+        config = FewShotDataManagerConfig(data=tmp_path / name / "nerfstudio", dataparser=NerfstudioDataParserConfig())
         manager = config.setup(device="cpu", test_mode="inference")
         manager.set_effects(decide(manager.scene, EffectSettings(lens_distortion=choice)))
         for dataset in (manager.train_dataset, manager.eval_dataset):
@@ -207,9 +204,7 @@ def test_without_matched_depth_no_ray_is_trained_on_that_has_no_colour(tmp_path:
 
     def batch(choice: str):
         config = FewShotDataManagerConfig(
-            data=tmp_path / "llff",
-            dataparser=LLFFDataParserConfig(),
-            train_num_rays_per_batch=20,
+            data=tmp_path / "llff", dataparser=LLFFDataParserConfig(), train_num_rays_per_batch=20
         )
         manager = config.setup(device="cpu", test_mode="val")
         manager.set_effects(decide(manager.scene, EffectSettings(matched_depth=choice)))

@@ -21,11 +21,7 @@ from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.utils.errors import InputError
 
 DATA = Path(os.environ.get("SPARSESTYLE_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
-PARSERS = {
-    "llff": LLFFDataParserConfig,
-    "blender": BlenderDataParserConfig,
-    "nerfstudio": NerfstudioDataParserConfig,
-}
+PARSERS = {"llff": LLFFDataParserConfig, "blender": BlenderDataParserConfig, "nerfstudio": NerfstudioDataParserConfig}
 
 
 def training_views(folder: Path, layout: str = "llff") -> Scene:

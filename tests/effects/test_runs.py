@@ -18,7 +18,7 @@ from sparsestyle_ns.gallery.layout import RunPictures, gallery_page
 from sparsestyle_ns.pipelines import base as pipelines
 from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 from sparsestyle_ns.runs.run_folder import find_config
-from sparsestyle_ns.viewer.effects_panel import EffectsPanel
+from sparsestyle_ns.viewer.panel import EffectsPanel
 
 AUTO = [flag for flag in TINY if flag not in ("--pipeline.effects.empty-space", "on")]
 

@@ -11,13 +11,9 @@ from nerfstudio.scripts import train
 from PIL import Image
 
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.engine.hints import (
-    after_effects,
-    after_evaluation,
-    after_export,
-    finish,
-    resume_command,
-)
+from sparsestyle_ns.engine.hints import after_evaluation, after_export, finish, resume_command
+from sparsestyle_ns.prepare.measure_effects import next_command
+from sparsestyle_ns.prepare.prepare_options import EffectsOptions
 
 
 def parsed(command: list):
@@ -61,11 +57,13 @@ def test_resuming_a_run_that_something_else_began_names_its_checkpoints() -> Non
 
 
 def test_after_the_effects_comes_training_on_the_same_views() -> None:
-    config = parsed(after_effects(LLFFDataParserConfig(), Path("fern"), None, (1, 10, 19), None, None))
+    options = EffectsOptions(Path("fern"), view_ids=(1, 10, 19))
+    config = parsed(next_command(LLFFDataParserConfig(), options))
     assert config.method_name == "coarse-fewshot"
     assert config.pipeline.datamanager.view_ids == (1, 10, 19)
     assert config.data == Path("fern")
-    config = parsed(after_effects(LLFFDataParserConfig(), Path("fern"), 5, None, Path("run"), Path("hat.jpg")))
+    options = EffectsOptions(Path("fern"), num_views=5, coarse_run=Path("run"), style_image=Path("hat.jpg"))
+    config = parsed(next_command(LLFFDataParserConfig(), options))
     assert config.method_name == "hier-style"
     assert config.pipeline.coarse_run == Path("run")
     assert config.pipeline.style_image == Path("hat.jpg")

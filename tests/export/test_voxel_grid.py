@@ -54,7 +54,7 @@ def test_a_ray_through_voxels_is_the_sum_over_its_samples():
 def test_a_ray_that_misses_the_scene_sees_the_background():
     small = scene("box")
     segments = small.model.space.segments(torch.tensor([[5.0, 5.0, 5.0]]), torch.tensor([[0.0, 0.0, 1.0]]))
-    seen = render_voxels(small.voxels, segments, NUM_STEPS, False, small.model.background)
+    seen = render_voxels(small.voxels, segments, small.model)
     torch.testing.assert_close(seen, small.model.background[None])
 
 

@@ -2,11 +2,7 @@ import pytest
 import reference
 import torch
 
-from sparsestyle_ns.field_components.positional_encoding import (
-    PositionalEncoding,
-    positional_encoding,
-    revealed_levels,
-)
+from sparsestyle_ns.field_components.positional_encoding import PositionalEncoding, positional_encoding, revealed_levels
 
 
 @pytest.fixture

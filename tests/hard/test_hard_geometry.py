@@ -11,13 +11,7 @@ from torch.nn.functional import normalize
 from sparsestyle_ns.core.ndc import ndc_distance, ndc_rays
 from sparsestyle_ns.core.occupancy import DensityGrid, Occupancy, march
 from sparsestyle_ns.core.sampling import even_edges
-from sparsestyle_ns.core.spaces import (
-    BoxSpace,
-    ContractedSpace,
-    ForwardFacingSpace,
-    contract,
-    intersect_box,
-)
+from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace, contract, intersect_box
 from sparsestyle_ns.effects.layouts import build_space
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.rendering.baked_kernels import _is_occupied

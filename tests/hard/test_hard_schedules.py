@@ -10,10 +10,7 @@ from sparsestyle_ns.utils.errors import InputError
 
 
 @hard_case(
-    "schedules",
-    case="T = 0",
-    could_go_wrong="t / T divides by 0",
-    must_hold="λ is λ0 α from the first iteration on",
+    "schedules", case="T = 0", could_go_wrong="t / T divides by 0", must_hold="λ is λ0 α from the first iteration on"
 )
 def test_a_fall_that_takes_no_time_is_over():
     assert {content_weight(step, 10.0, 0.01, 0) for step in (0, 1, 10**9)} == {0.1}
@@ -41,12 +38,7 @@ def test_a_resumed_run_has_the_weight_of_one_without_a_break():
         assert content_weight(step, 10.0, 0.01, 100) == pytest.approx(expected, rel=1e-12)
 
 
-@hard_case(
-    "schedules",
-    case="λ0 = 0",
-    could_go_wrong="the logarithm of 0",
-    must_hold="the weight is 0 at all times",
-)
+@hard_case("schedules", case="λ0 = 0", could_go_wrong="the logarithm of 0", must_hold="the weight is 0 at all times")
 def test_no_weight_stays_no_weight():
     assert {content_weight(t, 0.0, alpha, 100) for t in (0, 1, 50, 100, 101) for alpha in (0.0, 0.01, 1.0, 7.0)} == {0}
 

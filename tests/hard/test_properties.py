@@ -323,7 +323,6 @@ def tiny_fields(seed, bias):
     volume.render_coarse,
     volume.freeze_samples,
     visible_samples.visible_samples,
-    visible_samples.evaluate_front_to_back,
     volume.accumulation_of,
     volume.render_packed,
     volume.render_stylised,
@@ -400,8 +399,8 @@ def test_baked_renders_are_pictures(seed, scene, rays, steps, resolution):
 
     marching = visible_samples.Marching(density_grid.Occupancy(2), steps, layout.unbounded, 1e-3)
     device = torch.device("cpu")
-    compiled = baked.render_baked(baked.BakedVolume(shade, resolution, device), segments, marching, torch.ones(3))
-    plain = baked.march_in_torch(baked.BakedVolume(shade, resolution, device), segments, marching, torch.ones(3))
+    compiled = baked.render_baked([baked.BakedVolume(shade, resolution, device)], segments, marching, torch.ones(3))
+    plain = baked.march_in_torch([baked.BakedVolume(shade, resolution, device)], segments, marching, torch.ones(3))
     for left, right in zip(compiled, plain, strict=True):
         assert (left.rgb >= -1e-6).all() and (left.rgb <= 1 + 1e-5).all()
         # A sample within rounding of a cell's border, or of 1e-3 of the light, may count in one of them alone.

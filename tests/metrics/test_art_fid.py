@@ -12,7 +12,7 @@ from reference import frechet_distance as slow_frechet_distance
 from torchvision.models import alexnet, inception_v3
 
 from sparsestyle_ns.cli import main
-from sparsestyle_ns.evaluation.path_frames import PathFrames
+from sparsestyle_ns.evaluation.held_out import PathFrames
 from sparsestyle_ns.evaluation.tables import report_tables
 from sparsestyle_ns.metrics import art_fid
 from sparsestyle_ns.metrics.art_fid import (

@@ -5,13 +5,7 @@ import torch
 from test_warping import FOCAL, HEIGHT, SHIFT, WIDTH, plane, surface, with_square
 from torchmetrics.functional import structural_similarity_index_measure
 
-from sparsestyle_ns.metrics.consistency import (
-    PathGeometry,
-    masked_distance,
-    masked_rmse,
-    masked_ssim,
-    pair_consistency,
-)
+from sparsestyle_ns.metrics.consistency import PathGeometry, masked_distance, masked_rmse, masked_ssim, pair_consistency
 from sparsestyle_ns.metrics.image import lpips_metric
 from sparsestyle_ns.metrics.warping import Correspondence, Surface, correspond, pixel_centers
 

@@ -5,13 +5,7 @@ import torch
 from torchvision.models import alexnet
 
 from sparsestyle_ns.metrics import image as module
-from sparsestyle_ns.metrics.image import (
-    ALEXNET_FILE,
-    image_metrics,
-    lpips_metric,
-    psnr,
-    st_lpips_metric,
-)
+from sparsestyle_ns.metrics.image import ALEXNET_FILE, image_metrics, lpips_metric, psnr, st_lpips_metric
 
 
 @pytest.fixture

@@ -3,14 +3,7 @@
 import pytest
 import torch
 
-from sparsestyle_ns.metrics.warping import (
-    Pinhole,
-    Surface,
-    correspond,
-    is_occluded,
-    pixel_centers,
-    sample_picture,
-)
+from sparsestyle_ns.metrics.warping import Pinhole, Surface, correspond, is_occluded, pixel_centers, sample_picture
 
 HEIGHT, WIDTH, FOCAL = 12, 32, 40.0
 SHIFT = 0.3

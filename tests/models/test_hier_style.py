@@ -16,7 +16,7 @@ from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid
 from sparsestyle_ns.fields import fine
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.models.hier_style import HierStyleModelConfig
-from sparsestyle_ns.rendering.baked_cache import MOST_BAKED
+from sparsestyle_ns.rendering.baked import MOST_BAKED
 from sparsestyle_ns.rendering.look import Look
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.utils.errors import InputError
@@ -40,13 +40,7 @@ def make_model(effects=SPARE, **settings):
 def make_untrained(effects=SPARE, seed=0, device="cpu", **settings):
     torch.manual_seed(seed)
     config = HierStyleModelConfig(
-        coarse_field=CoarseFieldConfig(
-            num_levels=3,
-            num_layers=2,
-            layer_width=16,
-            feature_dim=4,
-            direction_levels=2,
-        ),
+        coarse_field=CoarseFieldConfig(num_levels=3, num_layers=2, layer_width=16, feature_dim=4, direction_levels=2),
         hash_levels=2,
         min_resolution=4,
         max_resolution=8,
@@ -213,7 +207,7 @@ def test_the_hash_grid_is_tiny_cuda_nns_on_a_gpu_where_it_is_installed_and_the_c
 
 
 def test_a_picture_in_one_mode_leaves_the_models_own_as_it_was(model):
-    with pytest.raises(RuntimeError), model.rendering("exact"):
+    with pytest.raises(RuntimeError), model.display.rendering("exact"):
         assert model.display.look.mode == "exact"
         raise RuntimeError
     assert model.display.look.mode == "baked"

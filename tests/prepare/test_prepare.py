@@ -317,10 +317,7 @@ def frame_lists(key, value):
         (lists("distortion_params", [0.1]), r"has distortion_params \[0.1\]: give six numbers"),
         (lists("camera_angle_x", 4), r"has camera_angle_x 4: give the horizontal angle"),
         (frame_lists("fl_x", None), r"frame 1 \(from 0\) of .*has fl_x null: give a number"),
-        (
-            frame_lists("file_path", "r/a.jpg"),
-            "Two frames .*images/a.png and r/a.jpg, may both be of",
-        ),
+        (frame_lists("file_path", "r/a.jpg"), "Two frames .*images/a.png and r/a.jpg, may both be of"),
         (lists("val_filenames", "images/a.png"), r"val_filenames that is no list of names"),
         (lists("train_filenames", None), r"train_filenames that is no list of names"),
         (lists("train_filenames", ["images/gone.png"]), r"None of the photos with poses is in train_filenames"),

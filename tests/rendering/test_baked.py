@@ -144,7 +144,7 @@ def test_nothing_stays_nothing_and_a_trace_stays_a_trace():
 @pytest.mark.parametrize("space", SPACES)
 def test_a_field_whose_logarithm_is_trilinear_is_rendered_as_it_is(space, background, march):
     rays = bundle(space, min_transmittance=0.0)
-    found = march(volume_of(trilinear, 10), *rays, background)
+    found = march([volume_of(trilinear, 10)], *rays, background)
     expected = exact(trilinear, *rays, background)
     assert expected[0].rgb.std() > 0.05
     # Half a byte of a colour, and of a density 3%, which a ray that is half opaque shows as 1%.
@@ -157,7 +157,7 @@ def test_finer_voxels_come_closer_to_the_fields(space, fields):
     expected = exact(fields, *rays)
     errors = []
     for resolution in (2, 4, 8, 32):
-        found = render_baked(volume_of(fields, resolution), *rays, None)
+        found = render_baked([volume_of(fields, resolution)], *rays, None)
         errors.append((found[0].rgb - expected[0].rgb).abs().mean().item())
     assert sorted(errors, reverse=True) == errors
     assert errors[-1] < min(0.004, 0.1 * errors[0])
@@ -172,8 +172,8 @@ def test_the_compiled_march_is_the_one_in_torch(space, min_transmittance, fields
     rays = bundle(space, occupancy, min_transmittance)
     one, other = volume_of(fields), volume_of(fields)
     # The same codes, added up in another order.
-    assert_renders(march_compiled(one, *rays, WHITE), march_in_torch(other, *rays, WHITE), tolerance=2e-6)
-    assert_renders(march_compiled(other, *rays, WHITE), march_in_torch(one, *rays, WHITE), tolerance=2e-6)
+    assert_renders(march_compiled([one], *rays, WHITE), march_in_torch([other], *rays, WHITE), tolerance=2e-6)
+    assert_renders(march_compiled([other], *rays, WHITE), march_in_torch([one], *rays, WHITE), tolerance=2e-6)
 
 
 @pytest.mark.parametrize("march", MARCHES)
@@ -182,8 +182,8 @@ def test_a_volume_filled_in_parts_is_the_one_filled_at_once(march, fields):
     parts = []
     for part in (slice(0, 7), slice(7, 30), slice(30, 60)):
         rays = bundle("box", rays=tuple(tensor[part] for tensor in origins_directions))
-        parts.append(march(volume, *rays, None)[0].rgb)
-    whole = march(volume_of(fields), *bundle("box"), None)[0].rgb
+        parts.append(march([volume], *rays, None)[0].rgb)
+    whole = march([volume_of(fields)], *bundle("box"), None)[0].rgb
     torch.testing.assert_close(torch.cat(parts), whole, atol=1e-6, rtol=0)
 
 
@@ -191,10 +191,10 @@ def test_a_volume_filled_in_parts_is_the_one_filled_at_once(march, fields):
 def test_a_voxel_is_evaluated_once(march):
     recorder = Recorder()
     volume = volume_of(recorder)
-    first = march(volume, *bundle("box"), None)
+    first = march([volume], *bundle("box"), None)
     calls = len(recorder.calls)
     assert len(recorder.points.unique(dim=0)) == len(recorder.points)
-    assert_renders(march(volume, *bundle("box"), None), first, tolerance=0)
+    assert_renders(march([volume], *bundle("box"), None), first, tolerance=0)
     assert len(recorder.calls) == calls
 
 
@@ -204,7 +204,7 @@ def test_empty_cells_are_not_evaluated(march):
     occupancy.occupied.zero_()
     occupancy.occupied[1, 2, 2] = True
     recorder = Recorder()
-    found, _ = march(volume_of(recorder, 32), *bundle("box", occupancy), None)
+    found, _ = march([volume_of(recorder, 32)], *bundle("box", occupancy), None)
     assert found.accumulation.max() > 0.1
     # The cell reaches from −0.5 to 0 in x and from 0 to 0.5 in y and z, where voxels lie too: 9 along a side.
     low, high = torch.tensor([-0.5, 0.0, 0.0]), torch.tensor([0.0, 0.5, 0.5])
@@ -216,7 +216,7 @@ def test_empty_cells_are_not_evaluated(march):
 def test_nothing_is_evaluated_far_behind_a_surface(march):
     rays = bundle("box", rays=(torch.tensor([[-3.0, 0.1, 0.1]]), torch.tensor([[1.0, 0.0, 0.0]])))
     recorder = Recorder(density=1e4, stylised_density=1e4)
-    found, _ = march(volume_of(recorder), *rays, None)
+    found, _ = march([volume_of(recorder)], *rays, None)
     assert found.accumulation.item() == pytest.approx(1)
     step, voxel = 2 / STEPS, 2 / 30
     assert recorder.points[:, 0].max() <= -1 + max(LOOKAHEAD, SAMPLES_PER_PASS) * step + voxel
@@ -226,7 +226,7 @@ def test_nothing_is_evaluated_far_behind_a_surface(march):
 def test_a_ray_ends_where_the_coarse_surface_is_opaque_as_in_the_exact_render(march):
     # Stylising has made the surface transparent; behind it no more samples count.
     rays = bundle("box", rays=(torch.tensor([[-3.0, 0.1, 0.1]]), torch.tensor([[1.0, 0.0, 0.0]])))
-    (found, coarse) = march(volume_of(Recorder(density=1e4, stylised_density=1.0)), *rays, None)
+    (found, coarse) = march([volume_of(Recorder(density=1e4, stylised_density=1.0))], *rays, None)
     assert coarse.accumulation.item() == pytest.approx(1)
     one_sample = 1 - torch.exp(torch.tensor(-2 / STEPS))
     assert found.accumulation.item() == pytest.approx(one_sample.item(), rel=0.03)
@@ -237,7 +237,7 @@ def test_a_ray_ends_where_the_coarse_surface_is_opaque_as_in_the_exact_render(ma
 def test_rays_past_the_scene_show_the_background_and_evaluate_nothing(background, march):
     recorder = Recorder()
     origins, directions = rays_of("box")
-    for render in march(volume_of(recorder), *bundle("box", rays=(origins, -directions)), background):
+    for render in march([volume_of(recorder)], *bundle("box", rays=(origins, -directions)), background):
         expected = torch.zeros(3) if background is None else background
         torch.testing.assert_close(render.rgb, expected.expand(60, 3))
         assert (render.accumulation == 0).all()
@@ -251,7 +251,7 @@ def test_rays_past_the_scene_show_the_background_and_evaluate_nothing(background
 def test_the_last_interval_goes_on_to_infinity(density, opacity, space, march):
     occupancy = Occupancy(4)
     occupancy.occupied.zero_()
-    found, coarse = march(volume_of(Recorder(density, density)), *bundle(space, occupancy), None)
+    found, coarse = march([volume_of(Recorder(density, density))], *bundle(space, occupancy), None)
     assert found.accumulation.flatten().tolist() == pytest.approx([opacity] * 60)
     assert coarse.accumulation.flatten().tolist() == pytest.approx([opacity] * 60)
     assert found.s.flatten().tolist() == pytest.approx([1 - 0.5 / STEPS if opacity else 1.0] * 60)
@@ -263,15 +263,15 @@ def test_outside_of_the_cube_its_border_counts(march):
     rays = bundle("ndc", rays=(torch.tensor([[9.0, 0.0, 0.0]]), torch.tensor([[0.0, 0.0, -1.0]])))
     assert rays[0].positions(torch.tensor([[0.0]]))[0, 0, 0] > 2
     expected = exact(trilinear, *rays)  # which clamps positions
-    assert_renders(march(volume_of(trilinear, 10), *rays, None), expected, tolerance=0.012)
+    assert_renders(march([volume_of(trilinear, 10)], *rays, None), expected, tolerance=0.012)
 
 
 def test_a_ray_that_is_no_number_does_no_harm(fields):
     origins, directions = rays_of("box")
     origins[3], directions[5] = torch.nan, torch.nan
-    found, _ = march_compiled(volume_of(fields), *bundle("box", rays=(origins, directions)), None)
+    found, _ = march_compiled([volume_of(fields)], *bundle("box", rays=(origins, directions)), None)
     rest = torch.arange(60)[[index not in (3, 5) for index in range(60)]]
-    whole, _ = march_compiled(volume_of(fields), *bundle("box"), None)
+    whole, _ = march_compiled([volume_of(fields)], *bundle("box"), None)
     assert torch.equal(found.rgb[rest], whole.rgb[rest])
 
 
@@ -289,7 +289,7 @@ def test_memory_grows_with_the_bricks_that_rays_have_met_up_to_the_whole_cube():
 
 def test_a_picture_of_no_rays_is_empty(fields):
     rays = bundle("box", rays=(torch.zeros(0, 3), torch.zeros(0, 3)))
-    assert march_compiled(volume_of(fields), *rays, None)[0].rgb.shape == (0, 3)
+    assert march_compiled([volume_of(fields)], *rays, None)[0].rgb.shape == (0, 3)
 
 
 def test_a_volume_without_cells_is_refused():
@@ -303,4 +303,4 @@ def test_segments_of_another_kind_have_no_compiled_form():
         positions = lengths = distance = at_distance = None
 
     with pytest.raises(TypeError, match="march_in_torch"):
-        march_compiled(volume_of(trilinear), Spiral(), Marching(None, STEPS, False, 0.0), None)
+        march_compiled([volume_of(trilinear)], Spiral(), Marching(None, STEPS, False, 0.0), None)

@@ -8,15 +8,7 @@ sys.path.append(str(Path(__file__).parent))
 from clock import FakeClock
 
 from sparsestyle_ns.studies.curves import Curve
-from sparsestyle_ns.studies.time_budget import (
-    Budget,
-    Case,
-    OutOfTimeError,
-    Plan,
-    in_turns,
-    parse_duration,
-    run_plans,
-)
+from sparsestyle_ns.studies.time_budget import Budget, Case, OutOfTimeError, Plan, in_turns, parse_duration, run_plans
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.machine import LoadWatch
 
