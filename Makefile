@@ -64,5 +64,5 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 clean:
-	rm -rf .venv demo build dist *.egg-info .hypothesis .pytest_cache .ruff_cache
+	rm -rf .venv demo build dist *.egg-info .hypothesis .pytest_cache .ruff_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
