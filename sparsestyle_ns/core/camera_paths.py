@@ -107,3 +107,9 @@ def poses_around(
     back = normalize(positions - center, dim=-1)
     right = normalize(torch.linalg.cross(back.new_tensor([[0.0, 0.0, 1.0]]), back), dim=-1)
     return torch.stack([right, torch.linalg.cross(back, right), back, positions], dim=-1)
+
+
+def most_central(cameras: Cameras) -> int:
+    """The camera that the others stand around: the nearest to their mean position."""
+    positions = cameras.camera_to_worlds[..., 3]
+    return int((positions - positions.mean(dim=0)).norm(dim=-1).argmin())

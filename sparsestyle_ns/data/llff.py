@@ -21,6 +21,7 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn import functional as F
@@ -293,3 +294,11 @@ def _ndc_scene_box(
     margin = BOX_MARGIN * (high - low)
     margin[2] = 0
     return SceneBox(aabb=torch.stack([low - margin, high + margin]).float())
+
+
+llff_data = DataParserSpecification(
+    config=LLFFDataParserConfig(),
+    description="Forward-facing photos in an LLFF folder (poses_bounds.npy, images_8), for a scene in NDC.",
+)
+"""What nerfstudio's commands load to offer `llff-data`, while nerfstudio's own configs are still being imported: this
+module and what it imports may import no datamanager, pipeline or `TrainerConfig`."""

@@ -1,17 +1,27 @@
 """Reading a scene with any dataparser, with errors that name what is wrong; nerfstudio's own check next to nothing."""
 
+import json
+import math
 from dataclasses import replace
+from pathlib import Path
+from typing import Any, Dict
 
+import numpy as np
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from sparsestyle_ns.data.parser_choice import advice
 from sparsestyle_ns.data.photos import open_photo
 from sparsestyle_ns.data.scene_info import SCENE_INFO, SceneInfo
-from sparsestyle_ns.data.transforms import read_transforms
 from sparsestyle_ns.data.view_selection import BLENDER_VIEWS
 from sparsestyle_ns.utils.errors import InputError
+
+LENGTHS = ("fl_x", "fl_y", "w", "h")
+NUMBERS = ("cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
+ANGLE = "camera_angle_x"
+"""Entries, for all cameras or, in a frame, for its own: in pixels and above 0, any number, and in radians."""
 
 
 def _check_blender_files(config: BlenderDataParserConfig, split: str) -> None:
@@ -64,3 +74,95 @@ def _check_cameras(outputs: DataparserOutputs) -> None:
             f"The camera of {photo} has a pose that is not finite, or a focal length or size that is not above 0: "
             "correct it, or take the photo out of the scene."
         )
+
+
+def read_transforms(path: Path, with_angle: bool) -> Dict[str, Any]:
+    """What a `transforms….json` holds, in which every frame names a photo and has a camera pose.
+
+    Args:
+        with_angle: whether it must have `camera_angle_x`, the horizontal angle of view in radians.
+
+    Raises:
+        InputError: it isn't there, is no such file, or a frame, counted from 0, lacks something.
+    """
+    content = _read(path)
+    if with_angle:
+        _check_angle(str(path), content.get(ANGLE))
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"{path} has no list of frames: export the scene again.")
+    for index, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
+            raise InputError(f"Frame {index} (from 0) of {path} names no photo in file_path: correct it or drop it.")
+        if not _is_pose(frame.get("transform_matrix")):
+            raise InputError(
+                f"Frame {index} (from 0) of {path}, {frame['file_path']}, has a transform_matrix that is no camera "
+                "pose, which is a 4x4 matrix of finite numbers with three independent directions: correct it or drop "
+                "the frame."
+            )
+    return content
+
+
+def check_lenses(path: Path, content: Dict[str, Any]) -> None:
+    """Raises an `InputError` if what `read_transforms` read of a lens or size is no number that a camera can have."""
+    frames = [(f"frame {index} (from 0) of {path}", frame) for index, frame in enumerate(content["frames"])]
+    for where, given in [(str(path), content), *frames]:
+        for key in LENGTHS:
+            if key in given and not _number(given[key]) > 0:
+                raise InputError(f"{where} has {key} {_shown(given[key])}: give a number of pixels above 0.")
+        for key in NUMBERS:
+            if key in given and math.isnan(_number(given[key])):
+                raise InputError(f"{where} has {key} {_shown(given[key])}: give a number, or take it out.")
+        if ANGLE in given:
+            _check_angle(where, given[ANGLE])
+        lens = given.get("distortion_params", [0.0] * 6)
+        if not isinstance(lens, list) or len(lens) not in (6, 12) or any(math.isnan(_number(value)) for value in lens):
+            raise InputError(
+                f"{where} has distortion_params {_shown(lens)}: give six numbers, twelve of a FISHEYE624, or take it "
+                "out."
+            )
+
+
+def _check_angle(where: str, angle: Any) -> None:
+    if not 0 < _number(angle) < math.pi:
+        raise InputError(
+            f"{where} has {ANGLE} {_shown(angle)}: give the horizontal angle of view in radians, above 0 and below π."
+        )
+
+
+def _read(path: Path) -> Dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        where = f"{path.parent} has no {path.name}" if path.parent.is_dir() else f"There is no folder {path.parent}"
+        what = advice(path.parent, path.name) or "; name the folder of a scene with --data"
+        raise InputError(f"{where}{what}.") from error
+    except (OSError, ValueError, RecursionError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
+        raise InputError(f"{path} can't be read as JSON ({error}): export the scene again.") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path} holds no JSON object with frames: export the scene again.")
+    return content
+
+
+def _number(value: Any) -> float:
+    """The value if it is a number, else NaN."""
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return float(value) if is_number and abs(value) < 1e30 else math.nan
+
+
+def _shown(value: Any) -> str:
+    """A value as JSON has it, cut short where it is long."""
+    text = json.dumps(value)
+    return text if len(text) <= 60 else text[:59] + "…"
+
+
+def _is_pose(matrix: Any) -> bool:
+    """Whether this is a 4x4 (or, without its last row, 3x4) matrix whose 3x3 part can be turned around."""
+    try:
+        pose = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return False
+    if pose.shape not in ((4, 4), (3, 4)) or not (np.abs(pose) < 1e15).all():
+        return False
+    directions = pose[:3, :3] / np.linalg.norm(pose[:3, :3], axis=0, keepdims=True).clip(min=1e-12)
+    return bool(abs(np.linalg.det(directions)) > 1e-3)

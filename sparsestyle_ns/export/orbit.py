@@ -55,12 +55,6 @@ def pinholes(cameras: Cameras, longest: Optional[int] = None) -> Cameras:
     return plain
 
 
-def most_central(cameras: Cameras) -> int:
-    """The camera that the others stand around: the nearest to their mean position."""
-    positions = cameras.camera_to_worlds[..., 3]
-    return int((positions - positions.mean(dim=0)).norm(dim=-1).argmin())
-
-
 def make_orbit(space: Space, cameras: Cameras, opening: int, depth: float) -> Orbit:
     """Where the camera may go from `opening` and still show what the photos have shown.
 

@@ -15,9 +15,10 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from sparsestyle_ns.core.camera_paths import most_central
 from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace, Space
 from sparsestyle_ns.evaluation.held_out import MIN_ACCUMULATION
-from sparsestyle_ns.export.orbit import Orbit, make_orbit, most_central, pinholes, survey
+from sparsestyle_ns.export.orbit import Orbit, make_orbit, pinholes, survey
 from sparsestyle_ns.export.stylised_scene import StylisedScene, exact_pictures
 from sparsestyle_ns.export.voxel_grid import EMPTY, ROUNDING, VoxelGrid, bake_voxels, picture_of_voxels
 from sparsestyle_ns.metrics.image import psnr

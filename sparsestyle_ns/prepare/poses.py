@@ -9,7 +9,7 @@ from typing import Any, Callable, Dict, List, Optional, Sequence, Union
 import numpy as np
 
 from sparsestyle_ns.data.llff import read_poses_bounds
-from sparsestyle_ns.data.transforms import check_lenses, read_transforms
+from sparsestyle_ns.data.reading import check_lenses, read_transforms
 from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, Photo, Size, read_photo
 from sparsestyle_ns.utils.errors import InputError
 

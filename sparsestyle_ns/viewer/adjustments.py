@@ -3,17 +3,18 @@
 import math
 from typing import Any, Callable, List
 
-import numpy as np
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from viser import ClientHandle
 
+from sparsestyle_ns.core.camera_paths import most_central
+
 
 def begin_at_central_photo(viewer: Viewer, cameras: Cameras) -> None:
     """Has each new browser look at the scene as its most central photo does."""
-    poses = cameras.camera_to_worlds.cpu().double().numpy()
-    centre = int(np.argmin(np.linalg.norm(poses[:, :, 3] - poses[:, :, 3].mean(axis=0), axis=-1)))
-    pose, position = poses[centre], VISER_NERFSTUDIO_SCALE_RATIO * poses[centre, :, 3]
+    centre = most_central(cameras)
+    pose = cameras.camera_to_worlds[centre].cpu().double().numpy()
+    position = VISER_NERFSTUDIO_SCALE_RATIO * pose[:, 3]
 
     def welcome(client: ClientHandle) -> None:
         with client.atomic():

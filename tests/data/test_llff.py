@@ -465,7 +465,7 @@ def test_nerfstudio_finds_llff_data_without_a_circular_import():
     """In a fresh process, as `ns-train` does: the specification first, then the registry of dataparsers."""
     code = """
 import sys
-import sparsestyle_ns.data.llff_specification
+import sparsestyle_ns.data.llff
 heavy = ("nerfstudio.data.datamanagers", "nerfstudio.pipelines", "nerfstudio.engine", "nerfstudio.models")
 loaded = [name for name in sys.modules if name.startswith(heavy)]
 assert not loaded, loaded

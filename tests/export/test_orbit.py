@@ -6,7 +6,8 @@ import pytest
 import torch
 from small_scenes import KINDS, WIDTH, look_from, scene
 
-from sparsestyle_ns.export.orbit import most_central, pinholes, rotation, survey, turned
+from sparsestyle_ns.core.camera_paths import most_central
+from sparsestyle_ns.export.orbit import pinholes, rotation, survey, turned
 
 
 @pytest.mark.parametrize("kind", KINDS)
