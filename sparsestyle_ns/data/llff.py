@@ -270,12 +270,8 @@ def _ndc_scene_box(
 
     A frustum is a polyhedron in NDC too, so the ends of the rays through the image's four corners bound it. The box is
     wider than they are by `BOX_MARGIN` of its width on each side in x and y, and is [-1, 1] in z.
-
-    Args:
-        camera_to_worlds: poses in the recentred, scaled world.
-        focals, size: focal lengths, width and height in pixels of the images as read.
-        focal_over_half_size: (2f/w, 2f/h) of NDC.
-        filenames: the views' images, to name one of which a part never reaches the near plane.
+    Poses are in the recentred, scaled world; focal lengths, width and height in pixels of the images as read. An
+    InputError names an image of which a part never reaches the near plane.
     """
     half_size = torch.tensor(size, dtype=focals.dtype) / 2
     corners = torch.tensor([[-1, -1], [-1, 1], [1, -1], [1, 1]], dtype=focals.dtype) * half_size

@@ -3,12 +3,15 @@
 nerfstudio's `NeRFEncoding` multiplies by 2π, so it can't give these frequencies exactly.
 """
 
-from typing import Optional
+from typing import Optional, Union
 
 import torch
 from jaxtyping import Float
 from nerfstudio.field_components.encodings import FieldComponent
 from torch import Tensor
+
+from sparsestyle_ns.field_components.hash_grid import GridLocation, HashGrid
+from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid
 
 
 def positional_encoding(
@@ -56,3 +59,34 @@ class PositionalEncoding(FieldComponent):
     def forward(self, in_tensor: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch encoded"]:
         """γ(x), each octave multiplied by `level_weights` where those are set."""
         return positional_encoding(in_tensor, self.num_levels, self.level_weights)
+
+
+class FrequencyEncoding(PositionalEncoding):
+    """γ(x) in the hash grid's place (Sec. 4.2, ablations): ten octaves end near three of its finest cells."""
+
+    def __init__(self, num_levels: int) -> None:
+        super().__init__(in_dim=3, num_levels=num_levels)
+
+    def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
+        """The points as they are."""
+        return GridLocation(positions, None)
+
+    def interpolate(self, location: GridLocation) -> Float[Tensor, "points encoded"]:
+        """γ at the points."""
+        return self(2.0 * location.positions - 1.0)
+
+
+class NoEncoding(FrequencyEncoding):
+    """No numbers at all: the residual field is left with e_c."""
+
+    def __init__(self) -> None:
+        super().__init__(num_levels=0)
+        self.out_dim = 0
+
+    def interpolate(self, location: GridLocation) -> Float[Tensor, "points 0"]:
+        """Nothing."""
+        return location.positions[:, :0]
+
+
+PointEncoding = Union[HashGrid, TinyCudaGrid, FrequencyEncoding, NoEncoding]
+"""`locate` gives what stays the same of points in [0, 1]³ while it learns, `interpolate` the encoding there."""

@@ -8,8 +8,8 @@ from nerfstudio.field_components.mlp import MLP
 from torch import Tensor, nn
 
 from sparsestyle_ns.field_components.hash_grid import GridLocation
-from sparsestyle_ns.field_components.point_encodings import PointEncoding
-from sparsestyle_ns.fields.chunked import in_chunks
+from sparsestyle_ns.field_components.positional_encoding import PointEncoding
+from sparsestyle_ns.fields.coarse import in_chunks
 
 
 class _NonNegative(torch.autograd.Function):

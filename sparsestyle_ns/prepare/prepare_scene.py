@@ -40,17 +40,10 @@ def prepare(options: PrepareOptions) -> None:
 
 
 def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> PreparedScene:
-    """Makes a scene of photos: of one size, with poses.
+    """Makes a scene of photos, of one size and with poses, in a folder that isn't there yet or is empty.
 
     Photos without poses are turned upright; photos with poses from a file stay as the poses are for them. What is wrong
-    with the photos is printed, a line each, and stops nothing.
-
-    Args:
-        output: the scene's folder; must not be there yet, or be empty.
-        source: where poses are from: a file beside the photos, COLMAP, or whichever of the two there is, in this order.
-
-    Raises:
-        InputError: the photos or poses can't be used, there is no way to poses, or COLMAP finds none.
+    with photos is printed, a line each; an InputError where they or their poses can't be used, or COLMAP finds none.
     """
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise InputError(f"{output} is there already; name a folder that isn't, with --output.")

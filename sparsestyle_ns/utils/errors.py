@@ -15,11 +15,7 @@ class CommandOptions:
     """The options of a `sparsestyle` command, a dataclass whose docstrings are the command's help."""
 
     def check(self) -> None:
-        """Finds what can't be used before torch is loaded, which takes seconds.
-
-        Raises:
-            InputError: an option can't be used.
-        """
+        """Raises an InputError for what can't be used, before torch is loaded, which takes seconds."""
 
 
 def exit_on_input_error(function: Callable[P, R]) -> Callable[P, R]:

@@ -1,7 +1,7 @@
 import torch
 from reference import positional_encoding
 
-from sparsestyle_ns.field_components.point_encodings import FrequencyEncoding, NoEncoding
+from sparsestyle_ns.field_components.positional_encoding import FrequencyEncoding, NoEncoding
 
 
 def points(count: int) -> torch.Tensor:

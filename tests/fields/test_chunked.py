@@ -1,7 +1,7 @@
 import torch
 
-from sparsestyle_ns.fields import chunked as pieces
-from sparsestyle_ns.fields.chunked import in_chunks
+from sparsestyle_ns.fields import coarse as pieces
+from sparsestyle_ns.fields.coarse import in_chunks
 
 
 def counted(calls):

@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from sparsestyle_ns.engine.training import FusedAdamConfig
 from sparsestyle_ns.field_components.hash_grid import HashGrid
-from sparsestyle_ns.field_components.point_encodings import NoEncoding
+from sparsestyle_ns.field_components.positional_encoding import NoEncoding
 from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid
 from sparsestyle_ns.fields import fine
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
