@@ -26,7 +26,7 @@ from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.spaces import Space
 from sparsestyle_ns.core.volrend import dense_weights, optical_depth
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.effects.base import EffectSettings
+from sparsestyle_ns.effects.decisions import EffectSettings
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.field_components.hash_grid import HashGrid

@@ -23,7 +23,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from benchmarks._measure import CACHE, ROOT, Measure, Options, Report, device_name, ratio_of_pairs, timed
 from benchmarks._scene import COARSE_METHOD
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.effects.base import EffectSettings
+from sparsestyle_ns.effects.decisions import EffectSettings
 from sparsestyle_ns.effects.registry import EFFECTS, decide
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.method_configs import method_config

@@ -18,7 +18,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from benchmarks._measure import Duration, Measure, Options, Report, ratio_of_pairs, timed
 from benchmarks._scene import COARSE_METHOD, Scene, at_size, find_scene, load_photos
-from sparsestyle_ns.effects.base import EffectSettings
+from sparsestyle_ns.effects.decisions import EffectSettings
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.metrics.image import psnr

@@ -14,7 +14,7 @@ import yaml
 from PIL import Image
 
 if TYPE_CHECKING:
-    from sparsestyle_ns.effects.base import Decisions
+    from sparsestyle_ns.effects.decisions import Decisions
     from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -53,7 +53,7 @@ TINY_STYLE = [
 
 def decided(*on: str, **parameters: Dict[str, List[float]]) -> "Decisions":
     """Decisions by which some effects are on, with parameters by the effect's name, and all others off."""
-    from sparsestyle_ns.effects.base import Decision, Decisions
+    from sparsestyle_ns.effects.decisions import Decision, Decisions
     from sparsestyle_ns.effects.registry import EFFECTS
 
     assert set(on) <= EFFECTS.keys()
@@ -73,7 +73,7 @@ def coarse_pipeline(scene: Path, **settings: Any) -> "CoarseFewShotPipeline":
     from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
     from sparsestyle_ns.data.llff import LLFFDataParserConfig
-    from sparsestyle_ns.effects.base import EffectSettings
+    from sparsestyle_ns.effects.decisions import EffectSettings
     from sparsestyle_ns.fields.coarse import CoarseFieldConfig
     from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
     from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig

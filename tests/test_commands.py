@@ -132,8 +132,8 @@ def test_a_stylised_checkpoint_holds_the_whole_scene_and_nothing_else(runs: Simp
 def test_a_stylised_run_renders_without_painting_weights_and_coarse_run(
     runs: SimpleNamespace, llff_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import sparsestyle_ns.pipelines.base as base
     import sparsestyle_ns.pipelines.hier_style as pipeline
+    import sparsestyle_ns.pipelines.scene_pipeline as base
 
     def refuse(*args: object) -> None:
         raise AssertionError("rendering asked for the painting or the feature network")

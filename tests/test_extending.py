@@ -19,8 +19,8 @@ from sparsestyle_ns.data.scene_info import SCENE_INFO, SceneInfo, scene_info
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.evaluation.held_out import stylisation_figures
-from sparsestyle_ns.losses.base import PaintingFeatures, StylizationLoss, StylizedView
 from sparsestyle_ns.losses.stylization import LOSSES
+from sparsestyle_ns.losses.stylization_loss import PaintingFeatures, StylizationLoss, StylizedView
 from sparsestyle_ns.metrics.image import gram_matrix
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig

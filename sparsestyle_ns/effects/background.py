@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestyle_ns.effects.base import Decisions, Measurement
+from sparsestyle_ns.effects.decisions import Decisions, Measurement
 from sparsestyle_ns.effects.layouts import MIN_EMPTY_BORDER
 from sparsestyle_ns.effects.scene import Scene
 

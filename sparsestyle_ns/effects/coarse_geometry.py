@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sparsestyle_ns.effects.base import Measurement
+from sparsestyle_ns.effects.decisions import Measurement
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_EMPTY = 0.1

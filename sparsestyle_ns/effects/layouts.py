@@ -7,7 +7,7 @@ from nerfstudio.data.scene_box import SceneBox
 from sparsestyle_ns.core.camera_paths import MAX_SPREAD, is_forward_facing, meeting_point, viewing_spread
 from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace, Space
 from sparsestyle_ns.data.scene_info import NDC
-from sparsestyle_ns.effects.base import Decisions, Measurement
+from sparsestyle_ns.effects.decisions import Decisions, Measurement
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_EMPTY_BORDER = 0.5

@@ -5,7 +5,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from sparsestyle_ns.data.matches import undistorted
-from sparsestyle_ns.effects.base import Measurement
+from sparsestyle_ns.effects.decisions import Measurement
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_PIXELS = 0.25

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from sparsestyle_ns.data.matches import PointMatches, why_unmatched
-from sparsestyle_ns.effects.base import Decisions, Measurement
+from sparsestyle_ns.effects.decisions import Decisions, Measurement
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_STOPS = 0.1

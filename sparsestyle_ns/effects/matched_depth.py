@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestyle_ns.data.matches import distances_along, why_unmatched
-from sparsestyle_ns.effects.base import Decisions, Measurement
+from sparsestyle_ns.effects.decisions import Decisions, Measurement
 from sparsestyle_ns.effects.scene import Scene
 
 MIN_POINTS = 100

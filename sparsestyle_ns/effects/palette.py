@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from sparsestyle_ns.effects.base import Measurement
+from sparsestyle_ns.effects.decisions import Measurement
 from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.style.color import color_moments, gaussian_distance
 

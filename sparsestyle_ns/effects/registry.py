@@ -3,8 +3,8 @@
 from typing import Callable, Dict, Literal, NamedTuple, Optional
 
 from sparsestyle_ns.effects.background import measure_background
-from sparsestyle_ns.effects.base import Decision, Decisions, EffectChoice, EffectSettings, Measurement
 from sparsestyle_ns.effects.coarse_geometry import measure_empty_space, measure_residual_density
+from sparsestyle_ns.effects.decisions import Decision, Decisions, EffectChoice, EffectSettings, Measurement
 from sparsestyle_ns.effects.layouts import measure_box, measure_contraction, measure_forward_facing
 from sparsestyle_ns.effects.lens_distortion import measure_lens_distortion
 from sparsestyle_ns.effects.matched_colors import measure_exposure, measure_view_color

@@ -8,7 +8,7 @@ from typing import Any, List, Optional, Sequence, Union
 
 from nerfstudio.engine.trainer import TrainerConfig
 
-from sparsestyle_ns.effects.base import EffectSettings
+from sparsestyle_ns.effects.decisions import EffectSettings
 from sparsestyle_ns.runs.coarse_run import read_coarse_run
 from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD
 from sparsestyle_ns.utils.progress import say

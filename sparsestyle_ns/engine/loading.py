@@ -8,7 +8,7 @@ from sparsestyle_ns.engine.hints import after_evaluation, finish
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.evaluation.held_out import HeldOutReport
 from sparsestyle_ns.evaluation.tables import report_tables
-from sparsestyle_ns.pipelines.base import CheckedPipeline
+from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import find_config
 from sparsestyle_ns.runs.scene_record import SceneRecord

@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from sparsestyle_ns.evaluation.held_out import exact_outputs
-from sparsestyle_ns.pipelines.base import CheckedPipeline
+from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.progress import say

@@ -11,7 +11,7 @@ import tyro
 from nerfstudio.utils import comms, writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.hints import scene_arguments
 from sparsestyle_ns.engine.trainer import SparseStyleTrainer, SparseStyleTrainerConfig

@@ -19,12 +19,12 @@ from nerfstudio.utils.decorators import check_main_thread, check_viewer_enabled
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.engine.hints import finish, ns_train_style, resume_command
 from sparsestyle_ns.engine.previews import preview_steps, write_preview
 from sparsestyle_ns.engine.training import check_skipped, training_step
-from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
+from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.runs import checkpoints
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path
 from sparsestyle_ns.runs.scene_record import record_scene

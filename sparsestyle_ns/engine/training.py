@@ -15,8 +15,8 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
 from torch.amp import GradScaler
 
-from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleTask
+from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestyle_ns.core.precision import at_least_float32
-from sparsestyle_ns.losses.base import StylizationLoss, StylizedView
+from sparsestyle_ns.losses.stylization_loss import StylizationLoss, StylizedView
 
 
 class ContentLoss(StylizationLoss):

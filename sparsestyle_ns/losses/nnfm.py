@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestyle_ns.core.precision import at_least_float32, without_autocast
-from sparsestyle_ns.losses.base import PaintingFeatures, StylizationLoss, StylizedView
 from sparsestyle_ns.losses.style_index import SHORTEST, StyleIndex, check_style, unit_vectors
+from sparsestyle_ns.losses.stylization_loss import PaintingFeatures, StylizationLoss, StylizedView
 
 CHUNK_SIZE = 2048
 """Feature vectors compared at once; 2048 × 2048 similarities are 16 MiB in float32."""

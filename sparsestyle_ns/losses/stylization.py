@@ -8,9 +8,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestyle_ns.losses.base import PaintingFeatures, StylizationLoss, StylizedView
 from sparsestyle_ns.losses.content import ContentLoss
 from sparsestyle_ns.losses.nnfm import NNFMLoss
+from sparsestyle_ns.losses.stylization_loss import PaintingFeatures, StylizationLoss, StylizedView
 from sparsestyle_ns.style.backbone import Backbone
 
 LOSSES: Dict[str, Type[StylizationLoss]] = {"content": ContentLoss, "style": NNFMLoss}

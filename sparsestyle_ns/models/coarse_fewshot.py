@@ -15,7 +15,7 @@ from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.schedules import ramp
 from sparsestyle_ns.core.spaces import Segments
 from sparsestyle_ns.core.volrend import distortion, effective_samples
-from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.field_components.positional_encoding import revealed_levels
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
 from sparsestyle_ns.losses.coarse import matched_depth_loss, near_density, reconstruction_loss

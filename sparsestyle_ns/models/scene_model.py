@@ -9,7 +9,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from sparsestyle_ns.core.precision import Precision
 from sparsestyle_ns.data.scene_info import NDC
 from sparsestyle_ns.effects.background import background_color
-from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.effects.layouts import build_space
 from sparsestyle_ns.effects.matched_colors import build_exposure
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig

@@ -16,8 +16,8 @@ from sparsestyle_ns.effects.registry import decide_again
 from sparsestyle_ns.losses.coarse import pooled_features, semantic_loss
 from sparsestyle_ns.losses.stylization import fit_side
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel, CoarseFewShotModelConfig
-from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
 from sparsestyle_ns.pipelines.datamanager import bundle_rays
+from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline, CheckedPipelineConfig
 from sparsestyle_ns.style.backbone import Backbone
 from sparsestyle_ns.utils.errors import InputError
 

@@ -27,7 +27,7 @@ from sparsestyle_ns.data.photos import SMALLEST_SIDE, PhotoDataset, at_size, che
 from sparsestyle_ns.data.reading import read_scene
 from sparsestyle_ns.data.scene_info import scene_info, select_outputs
 from sparsestyle_ns.data.view_selection import select_views
-from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.effects.matched_depth import MatchedRays, matched_rays
 from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.utils.distributed import num_processes

@@ -13,11 +13,11 @@ from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor, nn
 
 from sparsestyle_ns.core.schedules import content_weight
-from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.losses.coarse import reconstruction_loss
 from sparsestyle_ns.losses.stylization import LOSSES, Losses, StyleTargets, default_weights
 from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
-from sparsestyle_ns.pipelines.base import CheckedPipeline, CheckedPipelineConfig
+from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline, CheckedPipelineConfig
 from sparsestyle_ns.pipelines.scene_views import ContentView, SceneViews
 from sparsestyle_ns.style.backbone import Backbone
 from sparsestyle_ns.style.painting import Painting

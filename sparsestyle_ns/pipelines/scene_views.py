@@ -11,7 +11,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
 
 from sparsestyle_ns.core.camera_paths import at_poses, poses_between
-from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, TrainingPixels

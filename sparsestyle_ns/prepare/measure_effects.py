@@ -8,7 +8,7 @@ from typing import List
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 
 from sparsestyle_ns.data.parser_choice import parse_dataparser
-from sparsestyle_ns.effects.base import Decisions, EffectSettings
+from sparsestyle_ns.effects.decisions import Decisions, EffectSettings
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.hints import PAINTING, finish, flags_of, parser_arguments
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
-from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, load_checkpoint, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import COARSE_METHOD, find_config, read_config
 from sparsestyle_ns.runs.scene_record import RECORD_FILE, SceneRecord

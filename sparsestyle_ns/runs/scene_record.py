@@ -10,7 +10,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
 from sparsestyle_ns.data.scene_info import scene_info
 from sparsestyle_ns.effects.background import background_color
-from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.effects.registry import decided_on_photos
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError

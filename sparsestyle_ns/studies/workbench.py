@@ -18,9 +18,9 @@ from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.image import image_metrics
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
-from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig
+from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.pipelines.scene_views import SceneViews
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
 from sparsestyle_ns.runs.scene_record import record_scene

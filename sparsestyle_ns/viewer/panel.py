@@ -15,8 +15,8 @@ from nerfstudio.viewer.viewer_elements import ViewerControl
 from sparsestyle_ns.engine.restyling import Workshop
 from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.losses.stylization import Losses
-from sparsestyle_ns.pipelines.base import CheckedPipeline
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
+from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.rendering.look import Look, RenderMode
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes

@@ -21,7 +21,7 @@ from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingS
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.data.scene_info import NDC
 from sparsestyle_ns.effects.background import background_color
-from sparsestyle_ns.effects.base import EffectSettings
+from sparsestyle_ns.effects.decisions import EffectSettings
 from sparsestyle_ns.effects.matched_colors import build_exposure
 from sparsestyle_ns.effects.matched_depth import matched_rays
 from sparsestyle_ns.effects.registry import decide
@@ -29,7 +29,7 @@ from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModelConfig
 from sparsestyle_ns.models.hier_style import HierStyleModelConfig
-from sparsestyle_ns.pipelines import base as pipelines
+from sparsestyle_ns.pipelines import scene_pipeline as pipelines
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 

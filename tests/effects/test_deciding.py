@@ -15,7 +15,7 @@ from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.data.reading import read_scene
 from sparsestyle_ns.data.scene_info import select_outputs
-from sparsestyle_ns.effects.base import Decisions, EffectSettings
+from sparsestyle_ns.effects.decisions import Decisions, EffectSettings
 from sparsestyle_ns.effects.registry import EFFECTS, decide, decide_again, decided_on_photos
 from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.utils.errors import InputError

@@ -13,7 +13,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from torch import Tensor
 
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.effects.base import EffectSettings
+from sparsestyle_ns.effects.decisions import EffectSettings
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.method_configs import method_config

@@ -10,12 +10,12 @@ import torch
 import yaml
 from conftest import TINY, TINY_STYLE, decided, ns_train, only_run
 
-from sparsestyle_ns.effects.base import Decisions
+from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.effects.matched_colors import ExposureCorrection
 from sparsestyle_ns.effects.registry import EFFECTS, decided_on_photos
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.gallery.layout import RunPictures, gallery_page
-from sparsestyle_ns.pipelines import base as pipelines
+from sparsestyle_ns.pipelines import scene_pipeline as pipelines
 from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 from sparsestyle_ns.runs.run_folder import find_config
 from sparsestyle_ns.viewer.panel import EffectsPanel

@@ -14,7 +14,7 @@ from test_commands import write_ring, write_transforms
 
 from sparsestyle_ns.data.llff import LLFFDataParser, LLFFDataParserConfig
 from sparsestyle_ns.data.scene_info import SCENE_INFO, SceneInfo, scene_info
-from sparsestyle_ns.effects.base import EffectSettings
+from sparsestyle_ns.effects.decisions import EffectSettings
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.utils.errors import InputError

@@ -13,7 +13,7 @@ from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from torch.amp import GradScaler
 
 from sparsestyle_ns.data.scene_info import scene_info
-from sparsestyle_ns.effects.base import Decisions, EffectSettings
+from sparsestyle_ns.effects.decisions import Decisions, EffectSettings
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.evaluation.held_out import HeldOutReport, evaluate_held_out
 from sparsestyle_ns.losses.stylization import StyleTargets
