@@ -65,7 +65,7 @@ def check_photos(images: Sequence[Image.Image], names: Sequence[str]) -> List[st
     small = [shrink(image) for image in images]
     features = [find_features(image, MAX_FEATURES) for image in small]
     pairs = {
-        (first, second): compare(features[first], features[second], small[0].shape)
+        (first, second): compare_photos(features[first], features[second], small[0].shape)
         for first, second in track(list(combinations(range(len(images)), 2)), "Comparing photos")
     }
     return [*_faint(features, names), *_unlinked(pairs, names), *_without_depth(pairs, names)]
@@ -78,7 +78,7 @@ def shrink(image: Image.Image) -> np.ndarray:
     return np.asarray(grey)
 
 
-def compare(first: Features, second: Features, shape: Sequence[int]) -> Pair:
+def compare_photos(first: Features, second: Features, shape: Sequence[int]) -> Pair:
     """Matches two photos' features and looks at what geometry they agree on; `shape` is (rows, columns)."""
     here, there = mutual_matches(first.descriptors, second.descriptors, MAX_RATIO)
     start, end = first.points[here], second.points[there]

@@ -11,7 +11,7 @@ ALSO_KEEP = 1.1
 """How many times as fast another setting has to be before it is worth naming."""
 
 
-def duration(seconds: float) -> str:
+def rounded_duration(seconds: float) -> str:
     """0.35 s, 40 s, 3:05 min."""
     if seconds < 10:
         return f"{seconds:.2g} s"
@@ -43,7 +43,7 @@ def iterations_line(curve: Curve) -> str:
 def _result(curve: Curve, point: Point) -> str:
     value = point.median(curve.error)
     quality = f"{value:.1f} dB" if curve.error == "psnr" else f"style loss {value:.3f}"
-    return f"{duration(point.median(curve.time))}, {quality}"
+    return f"{rounded_duration(point.median(curve.time))}, {quality}"
 
 
 def setting_line(curve: Curve) -> str:

@@ -61,7 +61,7 @@ def timed_and_compared(
 
 
 @torch.no_grad()
-def in_chunks(bundle: RayBundle, samples: int, budget: Budget, render: Callable[[RayBundle], Colors]) -> Colors:
+def render_in_chunks(bundle: RayBundle, samples: int, budget: Budget, render: Callable[[RayBundle], Colors]) -> Colors:
     """Renders rays a few at a time, so that memory is bounded and the budget can end in between."""
     rays = max(1, POINTS_PER_CALL // samples)
     parts: List[Tensor] = []
@@ -159,7 +159,7 @@ def _sweep(
 
     def render(bundle: RayBundle) -> Colors:
         count = getattr(model.config, samples)
-        return in_chunks(bundle, count, budget, lambda part: model.get_outputs(part)[output])
+        return render_in_chunks(bundle, count, budget, lambda part: model.get_outputs(part)[output])
 
     probe = bench.some_rays(MIN_RAYS)
     render(probe)
@@ -238,7 +238,7 @@ def _measure_baking(bench: Workbench, curve: Curve, budget: Budget) -> None:
 
         at = frame % len(flight)
         rays = flight[at : at + 1].generate_rays(camera_indices=0, keep_shape=False).flatten()
-        return bench.timed(lambda: in_chunks(rays, model.config.num_steps, budget, render))
+        return bench.timed(lambda: render_in_chunks(rays, model.config.num_steps, budget, render))
 
     def measure_exact(round_: int) -> Mapping[str, Values]:
         if not exact:
@@ -291,10 +291,10 @@ def _measure_precision(bench: Workbench, curve: Curve, budget: Budget) -> None:
         f"{len(rays)} random rays of held-out views of the coarse field, against the same samples in float64; and "
         "iterations of stage 1."
     )
-    reference = in_chunks(rays, samples, budget, lambda part: in_float64(model, part))
+    reference = render_in_chunks(rays, samples, budget, lambda part: in_float64(model, part))
 
     def render(bundle: RayBundle) -> Colors:
-        return in_chunks(bundle, samples, budget, lambda part: model.get_outputs(part)["rgb"])
+        return render_in_chunks(bundle, samples, budget, lambda part: model.get_outputs(part)["rgb"])
 
     def case(precision: Precision) -> Case:
         training = bench.start(with_setting(bench.coarse_config, PRECISION, precision), budget)

@@ -6,7 +6,7 @@ from photo_sets import AHEAD, ASIDE, AWAY, TURNED, photo
 from PIL import Image, ImageFilter
 
 from sparsestyle_ns.data.features import find_features, linked_groups
-from sparsestyle_ns.prepare.diagnosis import MAX_FEATURES, check_photos, compare, shrink
+from sparsestyle_ns.prepare.diagnosis import MAX_FEATURES, check_photos, compare_photos, shrink
 
 NAMES = ["a.jpg", "b.jpg", "c.jpg"]
 
@@ -62,7 +62,7 @@ def test_one_photo_twice_is_named():
 
 def test_the_epipole_of_a_step_ahead_is_where_the_camera_went():
     first, second = (find_features(shrink(photo(place)), MAX_FEATURES) for place in (AHEAD[0], AHEAD[2]))
-    pair = compare(first, second, (240, 320))
+    pair = compare_photos(first, second, (240, 320))
     # The camera looks down a little and goes level: towards a point above the middle by tan(0.5/6) focal lengths.
     np.testing.assert_allclose(pair.epipole, [0.0, -0.85 * 0.5 / 6], atol=0.02)
 

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from sparsestyle_ns.studies.advice import duration, recommendation, setting_line
+from sparsestyle_ns.studies.advice import recommendation, rounded_duration, setting_line
 from sparsestyle_ns.studies.curves import Curve, root_mean_square
 from sparsestyle_ns.studies.tradeoff_report import Report
 from sparsestyle_ns.utils.errors import InputError
@@ -142,7 +142,7 @@ def test_a_busy_machine_is_named():
 
 @pytest.mark.parametrize(("seconds", "words"), [(0.354, "0.35 s"), (40.2, "40 s"), (185.0, "3:05 min")])
 def test_durations_in_words(seconds, words):
-    assert duration(seconds) == words
+    assert rounded_duration(seconds) == words
 
 
 # --------------------------------------------------------------------------------------------------------------- files
