@@ -40,6 +40,9 @@ def read_config(folder: Path) -> "TrainerConfig":
     """What is in the config.yml of a run's folder; InputError where it can't be read."""
     path = folder / "config.yml"
     try:
-        return yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
+        config = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
+        if not hasattr(config, "relative_model_dir"):
+            raise ValueError("it holds no settings of ns-train")
+        return config
     except Exception as error:  # yaml builds arbitrary objects, so anything can go wrong in it
         raise InputError(f"{path} can't be read ({error}); name the folder of a run that ns-train made.") from error

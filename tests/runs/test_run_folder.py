@@ -1,6 +1,6 @@
 import pytest
 
-from sparsestyle_ns.runs.run_folder import STYLE_METHOD, find_config
+from sparsestyle_ns.runs.run_folder import STYLE_METHOD, find_config, read_config
 from sparsestyle_ns.utils.errors import InputError
 
 
@@ -30,3 +30,12 @@ def test_what_is_missing_is_said(tmp_path):
         find_config(tmp_path)
     with pytest.raises(InputError, match="There is no run at"):
         find_config(tmp_path / "gone")
+
+
+@pytest.mark.parametrize(
+    "text", ["method_name: coarse-fewshot\n", "method_name: [coarse\n", "!!python/object:gone.Config {}"]
+)
+def test_a_config_that_cant_be_read_is_named(tmp_path, text):
+    (tmp_path / "config.yml").write_text(text)
+    with pytest.raises(InputError, match=r"config\.yml can't be read .*name the folder of a run"):
+        read_config(tmp_path)
