@@ -37,5 +37,5 @@ def test_what_is_missing_is_said(tmp_path):
 )
 def test_a_config_that_cant_be_read_is_named(tmp_path, text):
     (tmp_path / "config.yml").write_text(text)
-    with pytest.raises(InputError, match=r"config\.yml can't be read .*name the folder of a run"):
+    with pytest.raises(InputError, match=r"(?s)config\.yml can't be read .*name the folder of a run"):
         read_config(tmp_path)
