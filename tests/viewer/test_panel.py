@@ -99,6 +99,15 @@ def wait_for(panel: StylePanel) -> str:
     return shown_text(panel.restyling.message.content)
 
 
+def description_with(panel: StylePanel, part: str) -> str:
+    """What the panel says about its style, once that has a part: viser tells of a choice in a thread of its own."""
+    end = time.monotonic() + 10
+    while part not in (text := shown_text(panel.description.content)):
+        assert time.monotonic() < end, text
+        time.sleep(0.01)
+    return text
+
+
 def shown_text(markdown: str) -> str:
     """What a browser shows of escaped text."""
     return markdown.replace("<wbr />", "").replace("\\", "")
@@ -197,12 +206,9 @@ def test_a_style_whose_volume_was_thrown_away_is_filled_ahead_again(
 
 
 def test_the_panel_says_what_made_the_style(panel: StylePanel) -> None:
-    end = time.monotonic() + 10
-    while not panel.description.content and time.monotonic() < end:
-        time.sleep(0.01)  # viser tells of the last test's choice in a thread of its own
-    text = shown_text(panel.description.content)
+    text = description_with(panel, "**Painting** painting.png")
     assert "![painting](data:image/jpeg;base64," in text
-    assert "**Painting** painting.png" in text and "**Iterations** 3" in text
+    assert "**Iterations** 3" in text
     assert "**Features** vgg16" in text and "coarse-fewshot" in text.split("**Coarse run**")[1]
 
 
@@ -375,7 +381,7 @@ def test_a_style_that_cant_be_saved_is_there_and_says_so_and_leaves_no_folder(
     assert set(panel.folder.parent.iterdir()) == folders
     assert len(panel.styles) == count + 1 and panel.style.value == "unsaved"
     assert ("Run", f"not saved ({reason})") in panel.styles[-1].facts
-    assert str(panel.folder) not in shown_text(panel.description.content)
+    assert str(panel.folder) not in description_with(panel, f"not saved ({reason})")
 
 
 def test_two_restylings_of_a_second_are_two_runs(panel: StylePanel, monkeypatch: pytest.MonkeyPatch) -> None:
