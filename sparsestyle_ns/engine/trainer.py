@@ -5,7 +5,7 @@ import signal
 import warnings
 from abc import ABC, abstractmethod
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any, ClassVar, Dict, List, Literal, Optional, Tuple, Type
@@ -101,7 +101,7 @@ class SparseStyleTrainer(Trainer, ABC):
         if self.resumed is not None and "effects" in self.resumed:
             decided = Decisions.from_records(self.resumed["effects"])
             decided.check_choices(self.config.pipeline.effects, f"the checkpoint {self._resumed_checkpoint()}")
-            self.config.pipeline.decided = decided
+            self.config = replace(self.config, pipeline=replace(self.config.pipeline, decided=decided))
         super().setup(test_mode)
         if comms.is_main_process():
             manager, effects = self.pipeline.datamanager, self.pipeline.effects
@@ -115,7 +115,8 @@ class SparseStyleTrainer(Trainer, ABC):
     def _save_decisions(self) -> None:
         self.pipeline.effects.save(self.base_dir)
         self._saved_decisions = self.pipeline.effects
-        self.config.save_config()
+        decided = replace(self.config.pipeline, decided=self.pipeline.effects)
+        replace(self.config, pipeline=decided).save_config()
 
     @functools.cached_property
     def resumed(self) -> Optional[Dict[str, Any]]:

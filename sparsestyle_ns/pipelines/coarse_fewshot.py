@@ -139,7 +139,7 @@ class CoarseFewShotPipeline(CheckedPipeline):
         scene = self.datamanager.scene
         scene.coarse_density = lambda points: self.model.field.density_and_feature(points.to(self.device))[0]
         before = self.effects.on("empty_space")
-        self.config.decided = decide_again(self.effects, "empty_space", scene)
+        self.effects = decide_again(self.effects, "empty_space", scene)
         if self.effects.on("empty_space") != before:
             self.model.build_grid(self.effects)
             decision = self.effects["empty_space"]

@@ -35,7 +35,7 @@ class CheckedPipelineConfig(VanillaPipelineConfig):
     effects: EffectSettings = field(default_factory=EffectSettings)
     """Which effects are simulated; auto measures whether the scene needs them."""
     decided: tyro.conf.Suppress[Optional[Decisions]] = None
-    """What was decided, with its reasons; a loaded run has it and measures nothing."""
+    """What was decided for a run that exists, with its reasons; nothing is measured then."""
     vgg_weights: Annotated[Optional[Path], tyro.conf.arg(aliases=("--vgg-weights",))] = None
     """File with the weights of VGG-16. None: torchvision's, where they are cached or can be downloaded, else those in
     the package stlpips-pytorch."""
@@ -52,12 +52,13 @@ class CheckedPipelineConfig(VanillaPipelineConfig):
 class CheckedPipeline(VanillaPipeline):
     """A pipeline that ends with a clear sentence on bad input, and never loads a checkpoint in part.
 
-    It decides which of the scene's effects are simulated, unless its config says so already, and writes that into its
-    config as `decided`, by which a saved run is opened.
+    It decides which of the scene's effects are simulated, unless its config says so already, as that of a saved run.
     """
 
     config: CheckedPipelineConfig
     datamanager: FewShotDataManager
+    effects: Decisions
+    """What is simulated, and why."""
 
     @exit_on_input_error
     def __init__(
@@ -74,14 +75,13 @@ class CheckedPipeline(VanillaPipeline):
         self.world_size = 1  # several processes share the rays themselves (`utils.distributed`); no model is wrapped
         self.datamanager = config.datamanager.setup(device=device, test_mode=test_mode, local_rank=local_rank)
         self.datamanager.to(device)
-        if config.decided is None:
-            config.decided = decide(self.datamanager.scene, config.effects)
-        self.datamanager.set_effects(config.decided)
+        self.effects = config.decided or decide(self.datamanager.scene, config.effects)
+        self.datamanager.set_effects(self.effects)
         dataset = self.datamanager.train_dataset
         self._model = config.model.setup(
             scene_box=dataset.scene_box,
             num_train_data=len(dataset),
-            effects=config.decided,
+            effects=self.effects,
             ndc=scene_info(self.datamanager.train_dataparser_outputs).ndc,
             device=device,
         ).to(device)
@@ -89,12 +89,6 @@ class CheckedPipeline(VanillaPipeline):
         self.panel = None if config.panel is None else config.panel(self)  # nerfstudio's viewer finds it here
         if test_mode != "val":
             put_ffmpeg_on_path()
-
-    @property
-    def effects(self) -> Decisions:
-        """What is simulated, and why."""
-        assert self.config.decided is not None
-        return self.config.decided
 
     def announce(self, backbone: Backbone) -> None:
         """Says which feature network is in use, and where its weights came from."""

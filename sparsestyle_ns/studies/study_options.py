@@ -22,8 +22,8 @@ class StudyOptions(CommandOptions):
     output_path: Path
     """The HTML page to write."""
     output_dir: Path = Path("outputs/studies")
-    """Where the runs are; those that are there are used. Apart from other runs: hier-style takes the newest coarse run
-    below its own --output-dir, and must not find an ablation's."""
+    """Folder of the runs; those in it are used again. Keep other runs out of it: hier-style takes the newest coarse
+    run below its --output-dir, and that must not be an ablation's."""
     parser: str = "llff-data"
     """nerfstudio's name of the scene's dataparser."""
     max_image_side: Optional[int] = None
@@ -85,8 +85,8 @@ class TradeoffOptions(CommandOptions):
     data: Path
     """The scene, as for ns-train."""
     dataparser: Annotated[Tuple[str, ...], tyro.conf.Positional] = ()
-    """How to read it, where its files don't tell: llff-data, blender-data, colmap …; its options come after two dashes:
-    -- llff-data --eval-interval 4."""
+    """What reads the scene, where its files don't tell: llff-data, blender-data, colmap …; its options come after two
+    dashes: -- llff-data --eval-interval 4."""
     style_image: Optional[Path] = None
     """The painting; without it, what stylises is left out."""
     budget: str = "10m"
