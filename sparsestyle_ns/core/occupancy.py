@@ -11,6 +11,9 @@ from sparsestyle_ns.core.sampling import even_edges, sample_pdf
 from sparsestyle_ns.core.spaces import Segments
 from sparsestyle_ns.core.volrend import dense_weights, optical_depth
 
+LEAST_DENSITY = 1e-4
+"""Per half side of the cube; less shows nowhere."""
+
 
 def interval_lengths(
     segments: Segments, edges: Float[Tensor, "rays edges"], unbounded: bool
@@ -80,6 +83,33 @@ class DensityGrid(nn.Module):
         return sample_pdf(edges, (1.0 - even_share) * share + even_share / num_bins, num_samples, generator)
 
 
+class DensityVolume(nn.Module):
+    """σ of a frozen field at the centres of the cube's cells, `resolution` a side, interpolated in its logarithm."""
+
+    log_density: Float[Tensor, "x y z"]
+
+    def __init__(self, resolution: int) -> None:
+        super().__init__()
+        self.resolution = resolution
+        self.register_buffer("log_density", torch.zeros(resolution, resolution, resolution))
+
+    @torch.no_grad()
+    def measure(self, density: Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]], chunk: int) -> None:
+        """Takes the densities of a field, `chunk` points at a time."""
+        axis = (torch.arange(self.resolution, device=self.log_density.device) + 0.5) * (2.0 / self.resolution) - 1.0
+        found = []
+        for xs in axis.split(max(1, chunk // self.resolution**2)):
+            points = torch.stack(torch.meshgrid(xs, axis, axis, indexing="ij"), dim=-1)
+            found.append(density(points.reshape(-1, 3)).float().view(points.shape[:-1]))
+        self.log_density.copy_(torch.cat(found).clamp(min=LEAST_DENSITY).log())
+
+    def density(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """σ at positions, at least `LEAST_DENSITY`; outside of the cube that of its border."""
+        places = positions.reshape(1, 1, 1, -1, 3).flip(-1).to(self.log_density)
+        found = F.grid_sample(self.log_density[None, None], places, padding_mode="border", align_corners=False)
+        return found.view(positions.shape[:-1]).exp()
+
+
 class Occupancy(nn.Module):
     """Which cells of the cube, `resolution` a side, hold anything of a frozen field."""
 
@@ -96,17 +126,13 @@ class Occupancy(nn.Module):
         return self.occupied.float().mean().item()
 
     @torch.no_grad()
-    def measure(
-        self, density: Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]], min_alpha: float, chunk: int
-    ) -> None:
-        """Marks the cells with 1 − exp(−σ · cell side) above `min_alpha` at their centre, and their neighbours."""
-        side = 2.0 / self.resolution
-        axis = (torch.arange(self.resolution, device=self.occupied.device) + 0.5) * side - 1.0
-        alphas = []
-        for xs in axis.split(max(1, chunk // self.resolution**2)):
-            points = torch.stack(torch.meshgrid(xs, axis, axis, indexing="ij"), dim=-1)
-            alphas.append(-torch.expm1(-density(points.reshape(-1, 3)) * side).view(points.shape[:-1]))
-        occupied = (torch.cat(alphas) > min_alpha).float()
+    def measure(self, volume: DensityVolume, min_alpha: float) -> None:
+        """Marks the cells with 1 − exp(−σ · cell side) above `min_alpha` at their centre, and their neighbours.
+
+        The volume has the same resolution.
+        """
+        alpha = -torch.expm1(-volume.log_density.exp() * (2.0 / self.resolution))
+        occupied = (alpha > min_alpha).float()
         self.occupied.copy_(F.max_pool3d(occupied[None], kernel_size=3, stride=1, padding=1)[0] > 0)
 
     def contains(self, positions: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:

@@ -1,6 +1,8 @@
 """How strongly a loss counts at an iteration."""
 
 import math
+from dataclasses import dataclass
+from typing import Sequence, Tuple
 
 from sparsestyle_ns.utils.errors import InputError
 
@@ -27,3 +29,40 @@ def ramp(progress: float, start: float, length: float) -> float:
     if since >= length:
         return 1.0
     return since / length if since > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class Level:
+    """Iterations at one size of the pictures, of several that follow each other from small to large."""
+
+    scale: float
+    """The pictures' size, as a share of the largest's."""
+    first: int
+    """The first iteration."""
+    length: int
+    """How many there are."""
+
+
+def coarse_to_fine(scales: Sequence[float], shares: Sequence[float], total: int) -> Tuple[Level, ...]:
+    """Divides `total` iterations among sizes, each a scale in (0, 1], by shares above 0 whose sum needn't be 1.
+
+    Sizes that would get no iteration are left out, but for the last. InputError where scales or shares aren't such.
+    """
+    if not scales or len(scales) != len(shares) or not all(0.0 < scale <= 1.0 for scale in scales):
+        raise InputError(
+            f"Views' scales are {_listed(scales)} and their shares of the iterations {_listed(shares)}: give as many "
+            "shares as scales, and scales above 0 and up to 1."
+        )
+    if not all(0.0 < share < math.inf for share in shares):
+        raise InputError(f"The scales' shares of the iterations are {_listed(shares)}: give numbers above 0.")
+    borders = [0]
+    for place in range(len(scales)):
+        borders.append(round(total * sum(shares[: place + 1]) / sum(shares)))
+    levels = [
+        Level(scale, first, after - first) for scale, first, after in zip(scales, borders, borders[1:], strict=False)
+    ]
+    return (*(level for level in levels[:-1] if level.length > 0), levels[-1])
+
+
+def _listed(numbers: Sequence[float]) -> str:
+    return " ".join(f"{number:g}" for number in numbers) or "none"

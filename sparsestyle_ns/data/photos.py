@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, Dict, List, Literal, Sequence, Tuple
 
 import numpy as np
-from jaxtyping import Int, UInt8
+import torch.nn.functional as F
+from jaxtyping import Float, Int, UInt8
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
@@ -86,6 +87,19 @@ def at_size(cameras: Cameras, width: Int[Tensor, "views 1"], height: Int[Tensor,
     resized.fx, resized.cx, resized.width = cameras.fx * across, cameras.cx * across, width
     resized.fy, resized.cy, resized.height = cameras.fy * down, cameras.cy * down, height
     return resized
+
+
+def at_scale(cameras: Cameras, scale: float) -> Cameras:
+    """The same cameras for images at a share of their size in (0, 1], rounded to whole pixels."""
+    width, height = ((side * scale).round().long().clamp(min=1) for side in (cameras.width, cameras.height))
+    return cameras if scale == 1.0 else at_size(cameras, width, height)
+
+
+def reduced(image: Float[Tensor, "H W channels"], size: Tuple[int, int]) -> Float[Tensor, "h w channels"]:
+    """An image at a smaller (height, width), each pixel the mean of those in its place."""
+    if tuple(image.shape[:2]) == size:
+        return image
+    return F.interpolate(image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
 
 
 def _check_content(path: Path, pixels: UInt8[np.ndarray, "H W channels"]) -> None:

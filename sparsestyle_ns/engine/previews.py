@@ -10,6 +10,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from PIL import Image
 from torch import Tensor
 
+from sparsestyle_ns.data.photos import reduced
 from sparsestyle_ns.evaluation.held_out import exact_outputs
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.utils.errors import InputError
@@ -56,7 +57,7 @@ def render_preview(pipeline: CheckedPipeline, longest_side: int) -> Float[Tensor
     if scale < 1.0:
         camera.rescale_output_resolution(scale)
     size = int(camera.height), int(camera.width)
-    photo = torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
+    photo = reduced(photo, size)
     pipeline.eval()
     outputs = exact_outputs(model, camera)
     pipeline.train()

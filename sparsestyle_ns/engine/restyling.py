@@ -95,12 +95,11 @@ class Restyling:
     def __iter__(self) -> Iterator[Progress]:
         yield Progress(f"Looking at {self.image.name}")
         pipeline, total = self.pipeline, self.iterations
-        targets = pipeline.config.targets_of(self.image, self.workshop.backbone, pipeline.device)
         scene = replace(pipeline.datamanager.scene, style_image=self.image.pixels)
         self.effects = decide_again(pipeline.effects, "palette", scene)  # what depends on the painting
         if pipeline.scene_views is None:
             yield Progress("Preparing the views, which the next style won't need")
-        task = pipeline.new_task(self.field, targets, self.effects)
+        task = pipeline.new_task(self.field, self.image, self.workshop.backbone, self.effects, total)
         warm_up = pipeline.config.warm_start_steps
         for step in warm_start(pipeline, task, self.optimizers):
             yield Progress(f"Warm start, step {step + 1} of {warm_up}", (step + 1) / (warm_up + total))

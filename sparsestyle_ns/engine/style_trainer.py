@@ -114,7 +114,7 @@ class HierStyleTrainer(SparseStyleTrainer):
 
     def _load_checkpoint(self) -> None:
         super()._load_checkpoint()
-        self.pipeline.targets = self.pipeline.config.targets_of(self._painting, self._backbone, self.pipeline.device)
+        self.pipeline.style = self._painting, self._backbone
         if self._coarse_run is not None:
             self.pipeline.model.adopt_coarse(self._coarse_run.model_state())
 

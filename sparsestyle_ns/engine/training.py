@@ -4,12 +4,12 @@ import copy
 import functools
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any, Callable, Dict, Iterator, Mapping, Optional, Tuple
+from typing import Any, Callable, Dict, Iterator, Mapping, Optional, Tuple, Type
 
 import torch
 from jaxtyping import Float
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
+from nerfstudio.engine.optimizers import AdamOptimizerConfig, OptimizerConfig, Optimizers
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
@@ -29,6 +29,18 @@ class FusedAdamConfig(AdamOptimizerConfig):
     """Decay of the running means of the gradient and its square."""
     fused: bool = True
     """Whether to use the fused implementation; the values are the same up to rounding."""
+
+
+@dataclass
+class MuonConfig(OptimizerConfig):
+    """Muon (Jordan 2024), for the matrices of hidden layers: each step is the gradient's nearest orthogonal matrix."""
+
+    _target: Type = torch.optim.Muon
+    lr: float = 0.02
+    eps: float = 1e-7
+    momentum: float = 0.95
+    """Decay of the running mean of gradients."""
+    weight_decay: float = 0.0
 
 
 def training_step(

@@ -32,6 +32,8 @@ from sparsestyle_ns.utils.progress import track
 
 EVEN_SAMPLES = 64
 """Even samples a ray on which `effective_samples` are counted: the number means something only with this one."""
+MOST_RAYS = 10_000
+"""Of a view, about; evenly spread, they have the mean of all."""
 MIN_ACCUMULATION = 0.5
 """Rays with less weight than this show background, and have no surface to be sharp."""
 
@@ -185,6 +187,7 @@ def stylisation_figures(
 def sharpness_figures(model: CoarseFewShotModel, camera: Cameras) -> Dict[str, float]:
     """Mean `effective_samples`, on `EVEN_SAMPLES` even ones, of a view's rays that meet a surface, where one does."""
     rays = camera.generate_rays(camera_indices=0, keep_shape=False).flatten()
+    rays = rays[:: max(1, len(rays) // MOST_RAYS)]
     counts = []
     for start in range(0, len(rays), model.config.eval_num_rays_per_chunk):
         part = rays[start : start + model.config.eval_num_rays_per_chunk]

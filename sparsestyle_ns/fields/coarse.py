@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Callable, Dict, Literal, Optional, Tuple
+from typing import Callable, Dict, List, Literal, Optional, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -81,6 +81,12 @@ class CoarseField(Field):
             self.direction_encoding = PositionalEncoding(in_dim=3, num_levels=direction_levels)
             direction_dim = self.direction_encoding.get_out_dim()
         self.color_head = MLP(feature_dim + direction_dim, num_layers=2, layer_width=layer_width // 2, out_dim=3)
+
+    def hidden_matrices(self) -> List[nn.Parameter]:
+        """The weights of hidden layers, which an optimiser for matrices may take (`engine.training.MuonConfig`)."""
+        layers = [layer for layer in self.trunk.modules() if isinstance(layer, nn.Linear)]
+        *hidden, _ = [layer for layer in self.color_head.modules() if isinstance(layer, nn.Linear)]
+        return [layer.weight for layer in (*layers, *hidden)]
 
     def density_and_feature(
         self, positions: Float[Tensor, "*batch 3"], thinning: Optional[Thinning] = None

@@ -7,9 +7,10 @@ from jaxtyping import Float
 from nerfstudio.field_components.mlp import MLP
 from torch import Tensor, nn
 
+from sparsestyle_ns.field_components.blocked_mlp import blocked_mlp
 from sparsestyle_ns.field_components.hash_grid import GridLocation
 from sparsestyle_ns.field_components.positional_encoding import PointEncoding
-from sparsestyle_ns.fields.coarse import in_chunks
+from sparsestyle_ns.field_components.thinned_mlp import Thinning
 
 
 class _NonNegative(torch.autograd.Function):
@@ -68,6 +69,7 @@ class ResidualField(nn.Module):
         )
         self.color_head = nn.Linear(layer_width, 3)
         self.density_head = nn.Linear(layer_width, 1) if with_density else None
+        self.thinning = Thinning(0.0)
         if self.density_head is not None:
             nn.init.zeros_(self.density_head.weight)
             nn.init.zeros_(self.density_head.bias)
@@ -79,14 +81,15 @@ class ResidualField(nn.Module):
     def forward(
         self, location: GridLocation, feature: Float[Tensor, "points feature"], coarse_density: Float[Tensor, "points"]
     ) -> Tuple[Float[Tensor, "points"], Float[Tensor, "points 3"]]:
-        """σ_f ≥ 0 (Eq. 3) and c_f in [0, 1] at located points, from e_c and σ_c there."""
-        return in_chunks(self._evaluate, self.grid.interpolate(location), feature, coarse_density)
+        """σ_f ≥ 0 (Eq. 3) and c_f in [0, 1] at located points, from e_c and σ_c there.
 
-    def _evaluate(self, encoded: Tensor, feature: Tensor, coarse_density: Tensor) -> Tuple[Tensor, Tensor]:
-        hidden = self.mlp(torch.cat([encoded, feature], dim=-1))
+        Gradients reach the parameters alone, from the points that `thinning` keeps.
+        """
+        hidden = [layer for layer in self.mlp.modules() if isinstance(layer, nn.Linear)]
+        heads = [self.color_head] if self.density_head is None else [self.color_head, self.density_head]
+        logits = blocked_mlp((self.grid.interpolate(location), feature), hidden, heads, self.thinning).float()
         # In half precision a sigmoid reaches 1 at a logit of 6, and has no gradient from there on.
-        color = torch.sigmoid(self.color_head(hidden).float())
+        color = torch.sigmoid(logits[:, :3])
         if self.density_head is None:
             return coarse_density, color
-        residual = self.density_scale * self.density_head(hidden).squeeze(-1).float()
-        return fine_density(residual, coarse_density), color
+        return fine_density(self.density_scale * logits[:, 3], coarse_density), color

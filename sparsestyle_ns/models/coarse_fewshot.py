@@ -9,7 +9,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from torch import Tensor
 from torch.nn import Parameter
 
-from sparsestyle_ns.core.occupancy import DensityGrid
+from sparsestyle_ns.core.occupancy import DensityGrid, DensityVolume
 from sparsestyle_ns.core.precision import autocast
 from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.schedules import ramp
@@ -21,7 +21,16 @@ from sparsestyle_ns.field_components.thinned_mlp import Thinning
 from sparsestyle_ns.losses.coarse import matched_depth_loss, near_density, reconstruction_loss
 from sparsestyle_ns.metrics.image import image_metrics, psnr_of_error
 from sparsestyle_ns.models.scene_model import SceneModel, SceneModelConfig
-from sparsestyle_ns.rendering.render import DenseRender, render_coarse, seen_behind, surface_distance
+from sparsestyle_ns.rendering.few_samples import FewSamples
+from sparsestyle_ns.rendering.render import (
+    POINTS_PER_CALL,
+    DenseRender,
+    render_coarse,
+    render_frozen,
+    seen_behind,
+    surface_distance,
+)
+from sparsestyle_ns.rendering.visible_samples import Marching
 from sparsestyle_ns.utils.distributed import gather_rays, num_processes, shard_rays
 from sparsestyle_ns.utils.errors import InputError
 
@@ -33,8 +42,12 @@ class CoarseFewShotModelConfig(SceneModelConfig):
     _target: Type = field(default_factory=lambda: CoarseFewShotModel)
     num_samples: int = 24
     """Samples a ray in training."""
-    num_eval_samples: int = 64
-    """Samples a ray in rendering."""
+    num_eval_samples: int = 8
+    """Samples a ray in pictures of a trained field, where its weight is; while it learns, as many as in training."""
+    num_steps: int = 128
+    """Even steps along a ray on which the weight of a trained field is looked for, in a volume of its densities."""
+    volume_resolution: int = 128
+    """Cells along a side of this volume."""
     num_bins: int = 64
     """Bins of the histogram that samples follow where empty space is skipped."""
     thinning: float = 2.0
@@ -75,7 +88,10 @@ class CoarseFewShotModel(SceneModel):
         self.field = self.config.coarse_field.setup(self.effects.on("view_color"))
         self.build_grid(self.effects)
         self.step = 0
-        self.num_steps = 1
+        self.num_iterations = 1
+        self.learns = False
+        self._volume: Optional[DensityVolume] = None
+        self._measured: Tuple[int, ...] = ()
 
     def build_grid(self, effects: Decisions) -> None:
         """Makes the grid that guides samples, or takes it away, as is decided; a new one knows nothing yet."""
@@ -84,22 +100,33 @@ class CoarseFewShotModel(SceneModel):
             self.grid = DensityGrid(self.config.grid_resolution).to(next(self.field.parameters()).device)
 
     def get_param_groups(self) -> Dict[str, List[Parameter]]:
-        """One group, `fields`: the field, and the photos' exposures where they are learned."""
+        """The matrices of hidden layers, and all else: the field's rest, and exposures where they are learned."""
         exposure = [] if self.exposure is None else list(self.exposure.parameters())
-        return {"fields": [*self.field.parameters(), *exposure]}
+        matrices = self.field.hidden_matrices()
+        names = {id(matrix) for matrix in matrices}
+        rest = [parameter for parameter in self.field.parameters() if id(parameter) not in names]
+        return {"fields": [*rest, *exposure], "hidden_layers": matrices}
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> List[TrainingCallback]:
-        """Tells the model the step before each iteration."""
+        """Tells the model the step before each iteration, and when it has learned all."""
+        self.learns = True
         if training_callback_attributes.trainer is not None:
-            self.num_steps = training_callback_attributes.trainer.config.max_num_iterations
-        return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self.update_to_step)]
+            self.num_iterations = training_callback_attributes.trainer.config.max_num_iterations
+        return [
+            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self.update_to_step),
+            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self.finish_learning()),
+        ]
+
+    def finish_learning(self) -> None:
+        """From now on pictures are those of a trained field."""
+        self.learns = False
 
     def update_to_step(self, step: int) -> None:
         """Sets what depends on the iteration: the jitter and the octaves that are revealed."""
         self.step = step
-        reveal, levels = self.config.frequency_reveal * self.num_steps, None
+        reveal, levels = self.config.frequency_reveal * self.num_iterations, None
         if self.training and step < reveal:
             levels = revealed_levels(step / reveal, self.config.coarse_field.num_levels)
         self.field.position_encoding.level_weights = levels
@@ -120,6 +147,16 @@ class CoarseFewShotModel(SceneModel):
         with autocast(self.device, self.config.precision):
             return render_coarse(self.field, segments, directions, edges, self.space.unbounded, background, thinning)
 
+    @torch.no_grad()
+    def marching(self) -> Marching:
+        """Where the samples of the trained field lie; its densities are measured if they have changed."""
+        versions = tuple(parameter._version for parameter in self.field.parameters())
+        if self._volume is None or versions != self._measured:
+            self._volume, self._measured = DensityVolume(self.config.volume_resolution).to(self.device), versions
+            self._volume.measure(lambda points: self.field.density_and_feature(points)[0], POINTS_PER_CALL)
+        few = FewSamples(self._volume, self.config.num_eval_samples)
+        return Marching(None, self.config.num_steps, self.space.unbounded, 0.0, few)
+
     def render_batch(self, segments: Segments, origins: Tensor, directions: Tensor) -> Tuple[DenseRender, Tensor]:
         """Renders the rays of a training step, each process its share; also returns the samples' borders."""
         generator = torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + self.step)
@@ -135,8 +172,14 @@ class CoarseFewShotModel(SceneModel):
         """`rgb`, `accumulation`, and `depth` in world units; in training also what the losses need."""
         segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
         if not self.training:
-            edges = self.place_samples(segments, self.config.num_eval_samples, None)
-            render = self.render(segments, ray_bundle.directions, edges)
+            if self.learns:
+                edges = self.place_samples(segments, self.config.num_samples, None)
+                render = self.render(segments, ray_bundle.directions, edges)
+            else:
+                with autocast(self.device, self.config.precision):
+                    render = render_frozen(
+                        self.field, segments, ray_bundle.directions, self.marching(), self.background
+                    )
             depth = surface_distance(segments, render.s)
             return {"rgb": render.rgb, "accumulation": render.accumulation, "depth": depth}
         render, edges = self.render_batch(segments, ray_bundle.origins, ray_bundle.directions)
@@ -177,7 +220,7 @@ class CoarseFewShotModel(SceneModel):
             return losses
         config = self.config
         if config.distortion_weight > 0:
-            grown = ramp(self.step / self.num_steps, config.distortion_start, config.distortion_ramp)
+            grown = ramp(self.step / self.num_iterations, config.distortion_start, config.distortion_ramp)
             weight = config.distortion_weight * grown
             losses["distortion_loss"] = weight * distortion(outputs["weights"], outputs["edges"]).mean()
         if "matched_s" in outputs:

@@ -9,14 +9,15 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 from torch.nn import Parameter
 
-from sparsestyle_ns.core.occupancy import Occupancy, march
+from sparsestyle_ns.core.occupancy import DensityVolume, Occupancy
 from sparsestyle_ns.core.precision import autocast
 from sparsestyle_ns.fields.fine import FineFieldConfig, FineTunedField, StylisedField
 from sparsestyle_ns.metrics.image import image_metrics
 from sparsestyle_ns.models.scene_model import SceneModel, SceneModelConfig
 from sparsestyle_ns.rendering import render
 from sparsestyle_ns.rendering.baked import BakedCache, BakedVolume, shade_of
-from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
+from sparsestyle_ns.rendering.few_samples import FewSamples
+from sparsestyle_ns.rendering.frozen_view import FrozenView, equal_runs
 from sparsestyle_ns.rendering.look import Display, Look, RenderMode
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.rendering.render import FrozenSamples, PackedRender, straight_color, surface_distance
@@ -35,9 +36,14 @@ class HierStyleModelConfig(FineFieldConfig, SceneModelConfig):
 
     _target: Type = field(default_factory=lambda: HierStyleModel)
     num_steps: int = 128
-    """Even steps along a ray; those in empty cells are skipped."""
+    """Even steps along a ray, on which the frozen coarse field is looked at; those in empty cells are skipped."""
+    num_samples: Optional[int] = 6
+    """Samples a ray on which the stylised field is looked at, where the coarse field's weight is; None: every step
+    that can show, as with a fine-tuned copy of the coarse field, whose weight moves."""
+    even_share: float = 0.25
+    """Share of these samples, in [0, 1), that is spread evenly where residual density may add to the geometry."""
     occupancy_resolution: int = 128
-    """Cells along a side of the grid that says what is empty, where empty space is skipped."""
+    """Cells along a side of the grids that say what is empty, and how dense what isn't."""
     min_alpha: float = 0.03
     """Opacity over a cell's side, in (0, 1), below which the coarse field counts as empty there."""
     min_transmittance: float = 1e-3
@@ -69,6 +75,7 @@ class HierStyleModel(SceneModel):
         config.settle_encoding(self._built_for())
         self.field = config.coarse_field.setup(effects.on("view_color")).requires_grad_(False)
         self.residual = self.new_style()
+        self.volume = DensityVolume(config.occupancy_resolution)
         self.occupancy = Occupancy(config.occupancy_resolution) if effects.on("empty_space") else None
         if self.exposure is not None:
             self.exposure.requires_grad_(False)
@@ -76,6 +83,10 @@ class HierStyleModel(SceneModel):
             if not 0.0 <= (value := getattr(config, name)) <= 1.0:
                 flag = name.replace("_", "-")
                 raise InputError(f"--pipeline.model.{flag} is {value}; give a number from 0 to 1.")
+        if config.num_samples is not None and config.num_samples < 1:
+            raise InputError(f"--pipeline.model.num-samples is {config.num_samples}; give 1 or more, or None.")
+        if not 0.0 <= config.even_share < 1.0:
+            raise InputError(f"--pipeline.model.even-share is {config.even_share}; give a number from 0 to below 1.")
         self.display = Display(Look(config.render_mode, Mix(config.strength, config.geometry_strength)))
         self.baked = BakedCache(
             lambda style: self.bake(config.bake_resolution, style),
@@ -94,7 +105,11 @@ class HierStyleModel(SceneModel):
     def marching(self) -> Marching:
         """Where the samples of the frozen coarse field lie."""
         config = self.config
-        return Marching(self.occupancy, config.num_steps, self.space.unbounded, config.min_transmittance)
+        few = None
+        if config.num_samples is not None and config.stylised_field == "residual":
+            even_share = config.even_share if self.effects.on("residual_density") else 0.0
+            few = FewSamples(self.volume, config.num_samples, even_share)
+        return Marching(self.occupancy, config.num_steps, self.space.unbounded, config.min_transmittance, few)
 
     def get_param_groups(self) -> Dict[str, List[Parameter]]:
         """One group, `fields`: the field that is stylised. The coarse field is frozen."""
@@ -110,23 +125,26 @@ class HierStyleModel(SceneModel):
         self.field.to(self.device)
         if isinstance(self.residual, FineTunedField):
             self.residual.field.load_state_dict(self.field.state_dict())
-        if self.occupancy is None:
-            return
         cells = self.config.occupancy_resolution**3
-        with autocast(self.device, self.config.precision), bar("Finding empty space", cells, unit="cells") as finding:
+        with autocast(self.device, self.config.precision), bar("Looking for surfaces", cells, unit="cells") as looking:
 
             def density(points: Tensor) -> Tensor:
                 values = self.field.density_and_feature(points)[0]
-                finding.advance(len(points))
+                looking.advance(len(points))
                 return values
 
-            self.occupancy.measure(density, self.config.min_alpha, render.POINTS_PER_CALL)
+            self.volume.measure(density, render.POINTS_PER_CALL)
+        if self.occupancy is not None:
+            self.occupancy.measure(self.volume, self.config.min_alpha)
 
     def freeze(self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]) -> FrozenSamples:
         """`freeze_samples` of rays for this model's own style."""
         with autocast(self.device, self.config.precision):
-            segments = self.space.segments(origins, directions)
-            return render.freeze_samples(self.field, self.residual, segments, self.marching)
+            frozen = [
+                render.freeze_samples(self.field, self.residual, self.space.segments(*part), self.marching)
+                for part in zip(origins.split(RAYS_PER_CALL), directions.split(RAYS_PER_CALL), strict=True)
+            ]
+            return FrozenSamples.joined(frozen, self.residual)
 
     def freeze_view(
         self,
@@ -136,12 +154,7 @@ class HierStyleModel(SceneModel):
         keep_bytes: float,
     ) -> FrozenView:
         """A view for whole-image steps, in chunks of at most `samples_per_chunk` samples (see `FrozenView`)."""
-        counts = []
-        for part in zip(origins.split(RAYS_PER_CALL), directions.split(RAYS_PER_CALL), strict=True):
-            segments = self.space.segments(*part)
-            samples = march(segments, self.occupancy, self.config.num_steps, self.space.unbounded)
-            counts.append(torch.bincount(samples.ray_indices, minlength=len(segments.hit)))
-        runs = split_by_samples(torch.cat(counts), samples_per_chunk)
+        runs = equal_runs(len(origins), samples_per_chunk // self.marching.most_samples)
         return FrozenView(runs, lambda run: self.freeze(origins[run], directions[run]), keep_bytes)
 
     def stylised(

@@ -133,7 +133,7 @@ class CoarseFewShotPipeline(CheckedPipeline):
     def decide_empty_space(self, step: int) -> None:
         """After every tenth of the iterations from three quarters on, measures whether skipping empty space pays."""
         # Before, the field is still half the fog that it starts as, and a measurement would say so.
-        done, total = step + 1, self.model.num_steps
+        done, total = step + 1, self.model.num_iterations
         if done % max(1, total // 10) or not 3 * total <= 4 * done < 4 * total:
             return
         scene = self.datamanager.scene

@@ -23,7 +23,7 @@ from nerfstudio.data.utils.dataloaders import RandIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from sparsestyle_ns.data.photos import SMALLEST_SIDE, PhotoDataset, at_size, check_one_size
+from sparsestyle_ns.data.photos import SMALLEST_SIDE, PhotoDataset, at_scale, at_size, check_one_size, reduced
 from sparsestyle_ns.data.reading import read_scene
 from sparsestyle_ns.data.scene_info import scene_info, select_outputs
 from sparsestyle_ns.data.view_selection import select_views
@@ -45,7 +45,7 @@ class FewShotDataManagerConfig(VanillaDataManagerConfig):
     view_ids: Annotated[Optional[Tuple[int, ...]], tyro.conf.arg(aliases=("--view-ids",))] = None
     """The photos to train on, by number, instead: an image's place in its sorted folder for LLFF, a frame's in
     transforms_train.json for Blender."""
-    max_image_side: Annotated[Optional[int], tyro.conf.arg(aliases=("--max-image-side",))] = 1008
+    max_image_side: Annotated[Optional[int], tyro.conf.arg(aliases=("--max-image-side",))] = 504
     """Photos whose longer side is over this many pixels are reduced to it."""
     matched_share: float = 0.25
     """Rays to matched points in a batch, over its other rays; none where `matched_depth` is off (see Effects)."""
@@ -172,7 +172,18 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
     def load_pixels(self) -> None:
         """Loads the training photos with all their rays, unless that is done already."""
         if not hasattr(self, "pixels"):
-            self.pixels = gather_pixels(self.train_dataset, self.device)
+            self.pixels = self.pixels_at(1.0)
+
+    @functools.cache  # noqa: B019 - a run has one data manager, as long as it lives
+    def pixels_at(self, scale: float) -> TrainingPixels:
+        """The training photos, reduced to a share of their size, with all their rays."""
+        return gather_pixels(self.train_dataset, self.device, scale)
+
+    @property
+    def photo_side(self) -> int:
+        """The longer side of the largest training photo, in pixels."""
+        cameras = self.train_dataset.cameras
+        return int(max(cameras.width.max(), cameras.height.max()))
 
     @functools.cached_property
     def matched(self) -> Optional[MatchedRays]:
@@ -228,15 +239,19 @@ def has_one_size(cameras: Cameras) -> bool:
     return len(cameras.width.unique()) == len(cameras.height.unique()) == 1
 
 
-def gather_pixels(dataset: InputDataset, device: Union[str, torch.device]) -> TrainingPixels:
-    """Loads all images of a dataset and generates the ray of each pixel."""
+def gather_pixels(dataset: InputDataset, device: Union[str, torch.device], scale: float = 1.0) -> TrainingPixels:
+    """Loads all images of a dataset, at a share of their size in (0, 1], and generates the ray of each pixel."""
     parts, starts, sizes = [], [0], []
+    cameras = at_scale(dataset.cameras, scale)
     for index in range(len(dataset)):
         data = dataset[index]
-        image = data["image"][..., :3]
-        rays = dataset.cameras.generate_rays(camera_indices=index, keep_shape=True).flatten()
+        size = int(cameras.height[index]), int(cameras.width[index])
+        image = reduced(data["image"][..., :3], size)
+        rays = cameras.generate_rays(camera_indices=index, keep_shape=True).flatten()
         count = len(rays)
-        mask = data["mask"].reshape(-1) > 0.5 if "mask" in data else torch.ones(count, dtype=torch.bool)
+        mask = torch.ones(count, dtype=torch.bool)
+        if "mask" in data:  # a pixel that is made of some that aren't trusted isn't either
+            mask = reduced(data["mask"].float().view(*data["image"].shape[:2], 1), size).reshape(-1) > 0.99
         trusted = mask.nonzero().squeeze(-1) + starts[-1]
         parts.append((rays.origins, rays.directions, image.reshape(-1, 3), torch.full((count,), index), trusted))
         starts.append(starts[-1] + count)

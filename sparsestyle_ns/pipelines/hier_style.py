@@ -12,8 +12,10 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor, nn
 
-from sparsestyle_ns.core.schedules import content_weight
+from sparsestyle_ns.core.schedules import Level, coarse_to_fine, content_weight
 from sparsestyle_ns.effects.decisions import Decisions
+from sparsestyle_ns.field_components.thinned_mlp import Thinning
+from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.losses.coarse import reconstruction_loss
 from sparsestyle_ns.losses.stylization import LOSSES, Losses, StyleTargets, default_weights
 from sparsestyle_ns.models.hier_style import HierStyleModel, HierStyleModelConfig
@@ -37,25 +39,36 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     coarse_run: Annotated[Optional[Path], tyro.conf.arg(aliases=("--coarse-run",))] = None
     """Folder or config.yml of the coarse-fewshot run to stylise. None: the newest finished one that matches the data
     and its settings, and where there is none it is trained first."""
-    feature_side: int = 504
-    """Longer side, in pixels, at which the feature network sees rendered views."""
+    view_scales: Tuple[float, ...] = (0.5, 1.0)
+    """Sizes at which the views are stylised, one after another, as shares of the photos'; the last is the one that
+    counts, and iterations before it are quick."""
+    scale_shares: Tuple[float, ...] = (0.6, 0.4)
+    """Shares of the iterations at these sizes."""
+    feature_side: Optional[int] = None
+    """Longer side, in pixels, at which the feature network sees rendered views of the photos' size. None: theirs."""
     style_side: Optional[int] = None
-    """Longer side at which it sees the style image: smaller gives finer strokes. None: as feature_side."""
+    """Longer side at which it sees the style image then: smaller gives finer strokes. None: as the views."""
     style_features: Optional[int] = None
     """Match with at most so many of the painting's feature vectors, drawn at random; None: all of them."""
     loss_weights: Dict[str, float] = field(default_factory=default_weights)
     """Weight of each loss, 0 or more; 0 is off. That of the content loss is λ0, which falls (Eq. 6)."""
     content_decay: float = 0.01
     """α, the share of the content loss's weight that is left in the end."""
-    content_steps: int = 100
-    """T, the iterations in which it falls."""
+    content_share: float = 0.6
+    """T, the iterations in which it falls, as a share of those at a size of the views."""
+    content_restart: float = 0.3
+    """The share of the content loss's weight with which each size but the first begins."""
     warm_start_steps: int = 60
     """Steps, before the first iteration, in which c_f is fitted to whole photos; 0 is the paper's start from grey."""
     novel_views: int = 0
     """Views between the photos to stylise as well, with the coarse render as their content."""
-    samples_per_chunk: int = 1 << 19
-    """Samples rendered at once: memory is bounded by about 5 KB for each. A view of fewer is rendered in one go; the
-    chunks of a larger one are rendered a second time in the backward pass."""
+    samples_per_chunk: int = 1 << 21
+    """Samples rendered at once: memory is bounded by about half a KB for each. A view of fewer is rendered in one go;
+    the chunks of a larger one are rendered a second time in the backward pass."""
+    thinning: float = 1.0
+    """Spares the residual field's backward pass samples with small gradients, as in stage 1; 0 keeps all samples."""
+    seed: int = 42
+    """Seed of what is spared; an iteration's choice depends on it and the iteration alone."""
     cache_gigabytes: Optional[float] = None
     """Memory for what never changes of the views; None: a quarter of what is free."""
 
@@ -75,25 +88,52 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
             raise InputError("There is no style image: name a painting with --style-image FILE.")
         return Painting.read(self.style_image), self.load_backbone(torch.device("cpu"))
 
-    def targets_of(self, painting: Painting, backbone: Backbone, device: torch.device) -> StyleTargets:
-        """A painting as the feature network sees it, with these settings; the network moves to the device."""
-        sides, losses = (self.feature_side, self.style_side or self.feature_side), list(self.weights_at(0))
+    def levels(self, iterations: int) -> Tuple[Level, ...]:
+        """Which iterations are at which size of the views; InputError where the settings give none."""
+        return coarse_to_fine(self.view_scales, self.scale_shares, iterations)
+
+    def targets_of(
+        self, painting: Painting, backbone: Backbone, device: torch.device, photo_side: int, scale: float = 1.0
+    ) -> StyleTargets:
+        """A painting as the feature network sees it, for views at a scale of photos of a size, with these settings.
+
+        The network moves to the device.
+        """
+        side = self.feature_side or photo_side
+        sides = (max(1, round(scale * each)) for each in (side, self.style_side or side))
+        losses = [name for name, weight in self.loss_weights.items() if weight > 0]
         return StyleTargets(backbone.to(device), painting.pixels.to(device), *sides, self.style_features, losses)
 
-    def weights_at(self, step: int) -> Dict[str, float]:
-        """The weight of each loss that is on, in an iteration; that of the content loss is λ(t) (Eq. 6)."""
+    def weights_at(self, step: int, level: Level) -> Dict[str, float]:
+        """The weight of each loss that is on, in an iteration; that of the content loss is λ(t) (Eq. 6).
+
+        λ falls again at each size of the views, each time to λ0 α.
+        """
         weights = {name: weight for name, weight in self.loss_weights.items() if weight > 0}
         if "content" in weights:
-            weights["content"] = content_weight(step, weights["content"], self.content_decay, self.content_steps)
+            start = 1.0 if level.first == 0 else self.content_restart
+            fall = start * weights["content"], self.content_decay / start, self.content_share * level.length
+            weights["content"] = content_weight(step - level.first, *fall)
         return weights
+
+
+class StyleLevel(NamedTuple):
+    """A painting and the views at one of their sizes."""
+
+    schedule: Level
+    targets: StyleTargets
+    views: List[ContentView]
 
 
 class StyleTask(NamedTuple):
     """A field that is on its way to a painting, and the views that it is stylised on, one an iteration."""
 
     style: nn.Module
-    targets: StyleTargets
-    views: List[ContentView]
+    levels: List[StyleLevel]
+
+    def level(self, step: int) -> StyleLevel:
+        """What counts in an iteration."""
+        return next(level for level in reversed(self.levels) if step >= level.schedule.first)
 
 
 class HierStylePipeline(CheckedPipeline):
@@ -101,33 +141,47 @@ class HierStylePipeline(CheckedPipeline):
 
     config: HierStylePipelineConfig
     model: HierStyleModel
+    style: Optional[Tuple[Painting, Backbone]] = None
+    """Painting and network; given before training is set up by whoever has read them already."""
     targets: Optional[StyleTargets] = None
-    """The painting; given before training is set up by whoever has read it already."""
+    """The painting, once training is set up, for views of the photos' size."""
     scene_views: Optional[SceneViews] = None
     task: Optional[StyleTask] = None
     """What this run trains, once it is set up."""
     on_losses: Optional[Callable[[int, Losses], None]] = None
     """Told of each iteration and its losses, by a viewer that shows them."""
 
-    def new_task(self, style: nn.Module, targets: StyleTargets, effects: Decisions) -> StyleTask:
+    def new_task(
+        self, style: nn.Module, painting: Painting, backbone: Backbone, effects: Decisions, iterations: int
+    ) -> StyleTask:
         """A field and a painting for the scene's views, which are shared as far as they depend on no painting."""
+        schedule = self.config.levels(iterations)
         if self.scene_views is None:
             self.scene_views = self.freeze_views()
-        return StyleTask(style, targets, self.scene_views.for_painting(targets, effects))
+        targets = [self.targets_of(painting, backbone, level.scale) for level in schedule]
+        scales = [level.scale for level in schedule]
+        views = self.scene_views.for_painting(dict(zip(scales, targets, strict=True)), effects)
+        return StyleTask(style, list(map(StyleLevel, schedule, targets, views)))
+
+    def targets_of(self, painting: Painting, backbone: Backbone, scale: float = 1.0) -> StyleTargets:
+        """A painting as the feature network sees it, for views at a scale of the photos."""
+        return self.config.targets_of(painting, backbone, self.device, self.datamanager.photo_side, scale)
 
     def freeze_views(self) -> SceneViews:
         """The scene's views, with all that depends on no style."""
-        sizes = self.config.novel_views, self.config.samples_per_chunk, self.config.cache_gigabytes
-        return SceneViews(self.model, self.datamanager, *sizes)
+        config = self.config
+        sizes = config.novel_views, config.samples_per_chunk, config.cache_gigabytes
+        return SceneViews(self.model, self.datamanager, config.view_scales, *sizes)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> List[TrainingCallback]:
         """Prepares the style and the views, as far as they aren't there already."""
-        if self.targets is None:
-            self.targets = self.config.targets_of(*self.config.load_style(), self.device)
-        self.announce(self.targets.backbone)
-        self.task = self.new_task(self.model.residual, self.targets, self.effects)
+        painting, backbone = self.style or self.config.load_style()
+        self.announce(backbone)
+        iterations = training_callback_attributes.trainer.config.max_num_iterations
+        self.task = self.new_task(self.model.residual, painting, backbone, self.effects, iterations)
+        self.targets = self.task.levels[-1].targets
         say(self.scene_views.report())
         return super().get_training_callbacks(training_callback_attributes)
 
@@ -139,14 +193,14 @@ class HierStylePipeline(CheckedPipeline):
         if path is None or not path.is_file():
             say(f"The painting {path} isn't there any more, so nothing is measured against it.")
             return None
-        return self.config.targets_of(*replace(self.config, style_image=path).load_style(), self.device)
+        return self.targets_of(*replace(self.config, style_image=path).load_style())
 
     def warm_start_loss(self, task: StyleTask, step: int) -> Dict[str, Float[Tensor, ""]]:
         """How far c_f, on the coarse geometry, is from the content picture of one photo; not in the paper.
 
         The features of VGG's third block hardly see colour; stylising from grey loses the palette.
         """
-        view = task.views[step % self.scene_views.num_photos]
+        view = task.levels[0].views[step % self.scene_views.num_photos]
         # A coarse field that is fine-tuned itself is fitted as a whole: it can't change colours with its geometry held.
         coarse_geometry = self.model.config.stylised_field == "residual"
         picture = self.scene_views.render(view, task.style, coarse_geometry)
@@ -154,10 +208,14 @@ class HierStylePipeline(CheckedPipeline):
 
     def losses(self, task: StyleTask, step: int) -> Tuple[Float[Tensor, "H W 3"], Losses]:
         """One whole view of a task, and its losses with their weights in this iteration (Eq. 5 and 6)."""
-        view = task.views[step % len(task.views)]
+        schedule, targets, views = task.level(step)
+        view = views[step % len(views)]
+        if isinstance(task.style, ResidualField):
+            generator = torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + step)
+            task.style.thinning = Thinning(self.config.thinning, generator)
         image = self.scene_views.render(view, task.style)
-        values = task.targets.losses(task.targets.view(image, view.features, view.accumulation))
-        return image, Losses(values, self.config.weights_at(step))
+        values = targets.losses(targets.view(image, view.features, view.accumulation))
+        return image, Losses(values, self.config.weights_at(step, schedule))
 
     def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Tensor], Dict[str, Tensor], Dict[str, Any]]:
         """One whole view: λ(t) L_content, L_style, and other losses that are on (Eq. 5 and 6)."""

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Iterator, List, Optional, Tuple
+from typing import Dict, List, Mapping, Optional, Sequence, Tuple
 
 import psutil
 import torch
@@ -11,6 +11,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
 
 from sparsestyle_ns.core.camera_paths import at_poses, poses_between
+from sparsestyle_ns.data.photos import at_scale
 from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.models.hier_style import HierStyleModel
@@ -20,6 +21,9 @@ from sparsestyle_ns.rendering.render import accumulation_of, seen_behind
 from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
 from sparsestyle_ns.utils.distributed import gather_rays, num_processes, shard_rays
 from sparsestyle_ns.utils.progress import track
+
+Palette = Tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]
+"""The matrix and the offset of `palette_transform`."""
 
 
 @dataclass
@@ -42,6 +46,7 @@ class SceneViews:
 
     Args:
         model: whose coarse field is final.
+        scales: sizes at which there are all of the views, as shares of the photos'; the largest last.
         novel_views: how many views between the photos there are.
         samples_per_chunk: samples that are rendered at once, at most.
         cache_gigabytes: memory for what never changes; None: a quarter of what is free.
@@ -52,21 +57,34 @@ class SceneViews:
         self,
         model: HierStyleModel,
         manager: FewShotDataManager,
+        scales: Sequence[float],
         novel_views: int,
         samples_per_chunk: int,
         cache_gigabytes: Optional[float],
     ) -> None:
-        pixels = manager.pixels
         self.model, self.samples_per_chunk = model, samples_per_chunk
-        self.num_photos = len(pixels.sizes)
+        self.num_photos = len(manager.train_dataset)
         if cache_gigabytes is None:
             on_gpu = model.device.type == "cuda"
             free = torch.cuda.mem_get_info()[0] if on_gpu else psutil.virtual_memory().available
             cache_gigabytes = free / 2**30 / 4 / num_processes()
         self._bytes_left = cache_gigabytes * 2**30
-        self.views = [self._photo_view(pixels, index) for index in track(range(self.num_photos), "Caching views")]
+        self.by_scale: Dict[float, List[ContentView]] = {scale: [] for scale in scales}
         novel = cameras_between(manager.train_dataset.cameras, novel_views)
-        self.views += [self._novel_view(camera) for camera in track(novel, "Caching novel views")]
+        work = [(scale, view) for scale in scales for view in (*range(self.num_photos), *novel)]
+        for scale, view in track(work, "Freezing views"):
+            is_photo = isinstance(view, int)
+            made = (
+                self._photo_view(manager.pixels_at(scale), view)
+                if is_photo
+                else self._novel_view(at_scale(view, scale))
+            )
+            self.by_scale[scale].append(made)
+
+    @property
+    def views(self) -> List[ContentView]:
+        """Those of all sizes."""
+        return [view for views in self.by_scale.values() for view in views]
 
     def _freeze(self, origins: Tensor, directions: Tensor) -> FrozenView:
         """The rays of a view that this process renders."""
@@ -93,28 +111,34 @@ class SceneViews:
         return ContentView(frozen, outputs["rgb_coarse"], outputs["accumulation_coarse"].squeeze(-1))
 
     @torch.no_grad()
-    def for_painting(self, targets: StyleTargets, effects: Decisions) -> List[ContentView]:
-        """The views with what they must stay like for one painting."""
-        views = self.views
-        if effects.on("palette"):
-            views = [replace(view, picture=picture, features=None) for view, picture in self._in_style_colors(targets)]
-        for view in views:
-            if view.features is None:  # those of a view's own picture are the same for every painting
-                view.features = targets.features(view.picture)
-        return views if self.model.background is not None else [replace(view, accumulation=None) for view in views]
+    def for_painting(self, targets: Mapping[float, StyleTargets], effects: Decisions) -> List[List[ContentView]]:
+        """The views, by their size, with what they must stay like for a painting, given for each scale."""
+        palette = self._palette(next(iter(targets.values())).style_image) if effects.on("palette") else None
+        return [
+            [self._for_painting(view, each, palette) for view in self.by_scale[scale]]
+            for scale, each in targets.items()
+        ]
 
-    def _in_style_colors(self, targets: StyleTargets) -> Iterator[Tuple[ContentView, Tensor]]:
-        """Views, and their pictures in the painting's colours; a background that is seen through the scene stays."""
-        photos = self.views[: self.num_photos]
+    def _for_painting(self, view: ContentView, targets: StyleTargets, palette: Optional[Palette]) -> ContentView:
+        """A view in the painting's colours, with features; a background that is seen through the scene stays."""
+        seen_through = self.model.background is not None
+        if palette is not None:
+            picture = apply_palette(view.picture, *palette, clamp=True)
+            if seen_through:
+                picture = torch.lerp(view.picture, picture, view.accumulation[..., None].clamp(0.0, 1.0))
+            view = replace(view, picture=picture, features=None)
+        if view.features is None:  # those of a view's own picture are the same for every painting
+            view.features = targets.features(view.picture)
+        return view if seen_through else replace(view, accumulation=None)
+
+    def _palette(self, style_image: Float[Tensor, "3 H W"]) -> Palette:
+        """The map of the photos' colours to the painting's."""
+        photos = list(self.by_scale.values())[-1][: self.num_photos]
         colors = torch.cat([view.picture.reshape(-1, 3) for view in photos])
         weight = torch.cat([view.accumulation.reshape(-1) for view in photos])
-        style = color_moments(targets.style_image.permute(1, 2, 0).reshape(-1, 3))
-        matrix, offset = palette_transform(*color_moments(colors, weight), *style)
-        for view in self.views:
-            picture = apply_palette(view.picture, matrix, offset, clamp=True)
-            if self.model.background is not None:
-                picture = torch.lerp(view.picture, picture, view.accumulation[..., None].clamp(0.0, 1.0))
-            yield view, picture
+        return palette_transform(
+            *color_moments(colors, weight), *color_moments(style_image.permute(1, 2, 0).reshape(-1, 3))
+        )
 
     def render(self, view: ContentView, style: nn.Module, coarse_geometry: bool = False) -> Float[Tensor, "H W 3"]:
         """The stylised picture of a view, to whose rays each process contributes its share; differentiable."""

@@ -6,25 +6,22 @@ all at once while only one chunk's activations exist at a time.
 """
 
 from functools import partial
+from itertools import pairwise
 from typing import Callable, List, Optional
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from sparsestyle_ns.rendering.render import FrozenSamples
 
 
-def split_by_samples(counts: Int[Tensor, "rays"], max_samples: int) -> List[slice]:
-    """Cuts rays into consecutive runs of at most `max_samples` samples; a longer single ray is a run of its own."""
-    runs, start, total = [], 0, 0
-    for ray, count in enumerate(counts.tolist()):
-        if total + count > max_samples and ray > start:
-            runs.append(slice(start, ray))
-            start, total = ray, 0
-        total += count
-    return [*runs, slice(start, len(counts))]
+def equal_runs(num_rays: int, most: int) -> List[slice]:
+    """Cuts rays into as few consecutive runs of about the same length as have at most so many each."""
+    count = max(1, -(-num_rays // max(1, most)))
+    borders = [num_rays * part // count for part in range(count + 1)]
+    return [slice(*pair) for pair in pairwise(borders)]
 
 
 class FrozenView:

@@ -1,5 +1,6 @@
 """Volume rendering of the fields: segments and fields in, pixels out."""
 
+import itertools
 from dataclasses import dataclass
 from typing import Optional, Sequence, Tuple
 
@@ -14,6 +15,7 @@ from sparsestyle_ns.field_components.hash_grid import GridLocation
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.fine import StylisedField
+from sparsestyle_ns.rendering.few_samples import cut_into_stretches
 from sparsestyle_ns.rendering.mixing import STYLISED, Appearance, Mix, mixed
 from sparsestyle_ns.rendering.visible_samples import Marching, visible_samples
 
@@ -103,7 +105,10 @@ def render_coarse(
 
 @dataclass
 class FrozenSamples:
-    """What the stylised field needs of a batch of rays and training doesn't change: samples, σ_c and e_c there."""
+    """What the stylised field needs of a batch of rays and training doesn't change: samples, σ_c and e_c there.
+
+    Where a sample stands for a stretch of its ray (`few_samples`), σ_c is the stretch's mean.
+    """
 
     samples: PackedSamples
     density: Float[Tensor, "samples"]
@@ -116,14 +121,55 @@ class FrozenSamples:
         """Memory that keeping these samples takes."""
         return sum(part.nbytes for part in (*self.samples, self.density, self.feature)) + self.location.num_bytes
 
+    @staticmethod
+    def joined(parts: Sequence["FrozenSamples"], stylised: StylisedField) -> "FrozenSamples":
+        """Batches of rays one after another."""
+        if len(parts) == 1:
+            return parts[0]
+        firsts = itertools.accumulate((part.num_rays for part in parts[:-1]), initial=0)
+        moved = [
+            part.samples._replace(ray_indices=part.samples.ray_indices + first)
+            for part, first in zip(parts, firsts, strict=True)
+        ]
+        samples = PackedSamples(*map(torch.cat, zip(*moved, strict=True)))
+        density, feature = (torch.cat([getattr(part, name) for part in parts]) for name in ("density", "feature"))
+        num_rays = sum(part.num_rays for part in parts)
+        return FrozenSamples(samples, density, feature, stylised.locate(samples.positions), num_rays)
+
 
 @torch.no_grad()
 def freeze_samples(
     field: CoarseField, stylised: StylisedField, segments: Segments, marching: Marching
 ) -> FrozenSamples:
     """Finds the samples of a batch of rays that can show, and evaluates the frozen coarse field there."""
-    samples, density, feature = visible_samples(field.density_and_feature, segments, marching)
+    samples, density, feature = frozen_field(field, segments, marching)
     return FrozenSamples(samples, density, feature, stylised.locate(samples.positions), len(segments.hit))
+
+
+@torch.no_grad()
+def frozen_field(
+    field: CoarseField, segments: Segments, marching: Marching
+) -> Tuple[PackedSamples, Float[Tensor, "samples"], Float[Tensor, "samples feature"]]:
+    """The samples of a batch of rays, with σ_c and e_c: few, or every step that can show."""
+    if marching.few is None:
+        return visible_samples(field.density_and_feature, segments, marching)
+    stretches = cut_into_stretches(segments, marching.few, marching.num_steps, marching.unbounded)
+    density, feature = field.density_and_feature(stretches.samples.positions)
+    return stretches.samples, stretches.density(marching.few.volume, density), feature
+
+
+@torch.no_grad()
+def render_frozen(
+    field: CoarseField,
+    segments: Segments,
+    directions: Float[Tensor, "rays 3"],
+    marching: Marching,
+    background: Background,
+) -> PackedRender:
+    """The coarse field alone, which doesn't learn any more."""
+    samples, density, feature = frozen_field(field, segments, marching)
+    color = field.color(feature, directions[samples.ray_indices])
+    return render_packed(samples, len(segments.hit), density, color, background)
 
 
 def accumulation_of(frozen: FrozenSamples) -> Float[Tensor, "rays 1"]:

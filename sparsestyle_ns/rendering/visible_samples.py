@@ -10,6 +10,7 @@ from torch import Tensor
 from sparsestyle_ns.core.occupancy import Occupancy, PackedSamples, march
 from sparsestyle_ns.core.spaces import Segments
 from sparsestyle_ns.core.volrend import optical_depth
+from sparsestyle_ns.rendering.few_samples import FewSamples
 
 SAMPLES_PER_PASS = 6
 """Samples of a ray that are evaluated before looking whether it goes on."""
@@ -26,6 +27,13 @@ class Marching:
     """Whether the last step goes on to infinity."""
     min_transmittance: float
     """Share of light left, in [0, 1), at which a ray ends."""
+    few: Optional[FewSamples] = None
+    """How few samples a frozen ray keeps; None: one for each step."""
+
+    @property
+    def most_samples(self) -> int:
+        """Samples that a ray has at most."""
+        return self.num_steps if self.few is None else self.few.count + self.unbounded
 
 
 DensityAndFeature = Callable[[Float[Tensor, "points 3"]], Tuple[Tensor, Tensor]]
@@ -59,7 +67,7 @@ def visible_samples(
         in_front = torch.cat([depth[:, None], behind[:, :-1]], dim=1)
         seen = torch.exp(-in_front)[place] > marching.min_transmittance
         depth = behind[:, -1]
-        found.append((index[seen], density[seen], feature[seen].float()))
+        found.append((index[seen], density[seen], feature[seen]))
     index, density, feature = (torch.cat(parts) for parts in zip(*found, strict=True))
     order = torch.argsort(index)
     return samples.select(index[order]), density[order], feature[order]
