@@ -419,13 +419,13 @@ def test_mixtures_of_fields_lie_between_them(seed, count, strength, geometry, bl
         assert (result >= values.amin(dim=0) * (1 - 1e-5)).all() and (result <= values.amax(dim=0) * (1 + 1e-5)).all()
 
 
-@covers(frozen_view.split_by_samples)
-@given(st.lists(st.integers(0, 1000), max_size=50), st.integers(1, 2000))
-def test_runs_of_rays_are_all_rays_in_order(counts, limit):
-    runs = frozen_view.split_by_samples(torch.tensor(counts, dtype=torch.long), limit)
+@covers(frozen_view.equal_runs)
+@given(st.integers(0, 5000), st.integers(-5, 6000))
+def test_runs_of_rays_are_all_rays_in_order(num_rays, limit):
+    runs = frozen_view.equal_runs(num_rays, limit)
     rays = [ray for run in runs for ray in range(run.start, run.stop)]
-    assert rays == list(range(len(counts)))
-    assert all(sum(counts[run]) <= limit or run.stop - run.start == 1 for run in runs)
+    assert rays == list(range(num_rays))
+    assert all(run.stop - run.start <= max(1, limit) for run in runs)
 
 
 @covers(precision.at_least_float32, precision.without_autocast)
