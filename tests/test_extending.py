@@ -156,7 +156,7 @@ def test_a_new_feature_network_brings_its_width_and_its_least_side(
     monkeypatch.setitem(BACKBONES, "patches", Patches)
     assert load_backbone("auto", tmp_path / "patches.pth").description.name == "patches"
 
-    training = training_of(runs, backbone="patches")
+    training = training_of(runs, backbone="patches", feature_side=64)  # both sizes in patches of 4
     assert training.step().isfinite()
     assert training.pipeline.task.levels[0].views[0].features.shape[1] == 48
     assert training.pipeline.targets.features(torch.rand(1, 40, 3)).shape[2] == 1
