@@ -1,3 +1,5 @@
+import itertools
+
 import pytest
 import torch
 from test_thinned_mlp import ALL, by_autograd, network, uneven_loss
@@ -61,7 +63,7 @@ def test_gradients_are_those_of_finite_differences(monkeypatch):
 def test_there_may_be_any_number_of_inputs_hidden_layers_and_heads(widths):
     torch.manual_seed(0)
     sizes = [6, 8, *widths]
-    hidden = nn.ModuleList([nn.Linear(*pair, dtype=torch.float64) for pair in zip(sizes, sizes[1:], strict=False)])
+    hidden = nn.ModuleList([nn.Linear(*pair, dtype=torch.float64) for pair in itertools.pairwise(sizes)])
     heads = nn.ModuleList([nn.Linear(sizes[-1], 2, dtype=torch.float64)])
     values = torch.randn(9, 6, dtype=torch.float64)
     for parts in ((6,), (1, 2, 3), (0, 6)):
