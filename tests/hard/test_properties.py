@@ -367,7 +367,8 @@ def test_renders_of_any_field_are_pictures(seed, scene, rays, steps, bias, numbe
         assert (render.accumulation <= 1 + 1e-6).all() and (render.s >= 0).all() and (render.s <= 1 + 1e-5).all()
         depth = volume.surface_distance(segments, render.s)
         assert depth.isfinite().all() and (depth >= 0).all()
-    shaded = baked.shade_of(field, residual, layout, number_format)(2 * torch.rand(5, 3) - 1)
+    with torch.no_grad():
+        shaded = baked.shade_of(field, residual, layout, number_format)(2 * torch.rand(5, 3) - 1)
     assert (shaded >= 0).all() and (shaded[:, 2:] <= 1).all()
     torch.testing.assert_close(volume.accumulation_of(frozen), again.accumulation)
     # What lies behind 1e-3 of the light is left out; bfloat16 rounds logits at the samples of one render alone.
