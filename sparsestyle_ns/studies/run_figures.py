@@ -57,8 +57,8 @@ class PaintingMeasure:
     def figures(self, frames: PathFrames, settings: HierStylePipelineConfig) -> Dict[str, float]:
         """Means over some frames of style strength and content kept, and their ArtFID; by a run's network and sizes."""
         if self._targets is None:
-            settings = replace(settings, style_image=self.painting)
-            self._targets = settings.targets_of(*settings.load_style(), torch.device("cpu"))
+            settings, side = replace(settings, style_image=self.painting), max(frames.stylised[0].shape[:2])
+            self._targets = settings.targets_of(*settings.load_style(), torch.device("cpu"), side)
         values, art_fid, gram = [], ArtFID.against(self._targets.style_image), gram_matrix(self._targets.style_rows())
         for index in track(range(0, len(frames.stylised), STYLE_EVERY), "Style and content"):
             stylised, coarse = frames.stylised[index], frames.coarse[index]
