@@ -75,8 +75,8 @@ def test_a_run_on_reduced_photos_is_shown_with_the_photos_as_they_are(runs, tmp_
     moved = tmp_path / "outputs" / "scene" / "hier-style" / "run"
     shutil.copytree(runs.style, moved)
     config = (moved / "config.yml").read_text()
-    assert "max_image_side: 1008" in config
-    (moved / "config.yml").write_text(config.replace("max_image_side: 1008", "max_image_side: 16"))
+    assert "max_image_side: 504" in config
+    (moved / "config.yml").write_text(config.replace("max_image_side: 504", "max_image_side: 16"))
     run = collect_run(moved, num_views=1, frames=0)
     assert dict(run.settings)["Photo size in training"] == "16 × 12 pixels"
     pictures = [photo.pixels for photo in run.photos]
