@@ -18,7 +18,7 @@ from sparsestyle_ns.engine.loading import evaluate_run, load_run
 from sparsestyle_ns.evaluation.held_out import PathFrames, render_path, saved_report, stylisation_figures
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID, missing_weights
-from sparsestyle_ns.metrics.image import gram_matrix, has_lpips, image_metrics
+from sparsestyle_ns.metrics.image import gram_matrix, has_lpips, structural_similarity
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import REPORT_FILE
@@ -64,7 +64,7 @@ class PaintingMeasure:
             stylised, coarse = frames.stylised[index], frames.coarse[index]
             covered = frames.surfaces[index].covered.float()
             figures = stylisation_figures(self._targets, gram, coarse, stylised, covered)
-            values.append({**figures, "unstylised_ssim": image_metrics(stylised, coarse)["ssim"]})
+            values.append({**figures, "unstylised_ssim": structural_similarity(stylised, coarse)})
             if art_fid is not None:
                 art_fid.add(stylised, coarse)
         means = {key: sum(value[key] for value in values) / len(values) for key in values[0]}
