@@ -14,9 +14,9 @@ import sys
 import time
 from pathlib import Path
 
-# Lines of the methods and of nerfstudio go elsewhere; the answers are all that is on standard output.
+# The answers are all that is on standard output; lines of the methods and of nerfstudio go nowhere.
 answers = os.fdopen(os.dup(1), "w")
-os.dup2(2, 1)
+os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 import torch  # noqa: E402
 from nerfstudio.engine.callbacks import TrainingCallbackLocation  # noqa: E402
