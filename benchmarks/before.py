@@ -236,9 +236,9 @@ def main(options: BeforeOptions) -> None:
     report.notes.append(
         "Both versions with the defaults of coarse-fewshot and hier-style, on the same coarse field; iterations of "
         "stage 2 at the size that is named, none at a smaller one. The earlier version's whole is extrapolated from "
-        "its seconds an iteration, without start, freezing, pictures on the way and files; ours is a whole command. The "
-        "first of everything is a warm-up that doesn't count: for the coarse field's view that is also when this version "
-        "measures the field's densities, once."
+        "its seconds an iteration, without start, freezing, pictures on the way and files; ours is a whole command. "
+        "The first of everything is a warm-up that doesn't count: for the coarse field's view that is also when this "
+        "version measures the field's densities, once."
     )
     for side in options.sides:
         is_last = side == options.sides[-1]
