@@ -37,7 +37,7 @@ class Options:
     """A still life, or objects seen from all around."""
     frames: int = 24
     """Frames of the film, 12 a second."""
-    film_side: int = 128
+    film_side: int = 252
     """Longer side of its frames in pixels, at least 16."""
     images: bool = False
     """Also write the film's frames as PNG files."""
@@ -59,7 +59,7 @@ def make_stages(options: Options) -> List[Stage]:
     folder = options.output
     scene, style, outputs = folder / "scene" / options.scene, folder / "style.png", folder / "outputs"
     film, page = folder / "stylised.mp4", folder / "index.html"
-    scene_flags = ["--layout", options.scene, "--width", "252" if options.scene == "llff" else "100"]
+    scene_flags = ["--layout", options.scene, "--width", "252"]
     make_scene = ["python", str(SCRIPTS / "make_sample_scene.py"), str(folder / "scene"), *scene_flags, "--force"]
     make_style = ["python", str(SCRIPTS / "make_style_image.py"), str(style)]
     coarse = train_command(COARSE, [], scene, outputs, options.iterations_coarse)

@@ -11,7 +11,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from sparsestyle_ns.effects.decisions import EffectSettings
 from sparsestyle_ns.engine.style_trainer import HierStyleTrainerConfig
 from sparsestyle_ns.engine.trainer import CoarseFewShotTrainer, SparseStyleTrainerConfig
-from sparsestyle_ns.engine.training import FusedAdamConfig, MuonConfig
+from sparsestyle_ns.engine.training import FusedAdamConfig, MuonConfig, WarmUpSchedulerConfig
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
@@ -34,8 +34,8 @@ def coarse_optimizers(iterations: int) -> Dict[str, Any]:
 
 
 def style_optimizers(milestones: Sequence[int]) -> Dict[str, Any]:
-    """Adam, whose learning rate is a third from each of some iterations on."""
-    return {"fields": adam(5e-3, MultiStepSchedulerConfig(gamma=0.33, milestones=tuple(milestones)))}
+    """Adam with a warm-up, whose learning rate is a third from each of some iterations on."""
+    return {"fields": adam(5e-3, WarmUpSchedulerConfig(milestones=tuple(milestones)))}
 
 
 def method(
@@ -67,7 +67,7 @@ def variant(of: MethodSpecification, suffix: str, description: str, settings: Di
     return MethodSpecification(config, description)
 
 
-COARSE_ITERATIONS, STYLE_ITERATIONS = 4000, 150
+COARSE_ITERATIONS, STYLE_ITERATIONS = 3000, 120
 coarse_fewshot = method(
     SparseStyleTrainerConfig,
     "Coarse radiance field from three to eight photos (stage 1): under four minutes on two CPU cores at 504 pixels.",
@@ -163,7 +163,8 @@ hier_style_paper = variant(
         "pipeline.scale_shares": (1.0,),
         "pipeline.content_share": 0.5,
         "pipeline.warm_start_steps": 0,
-        "optimizers": style_optimizers([50, 100]),
+        "pipeline.thinning": 0.0,
+        "optimizers": {"fields": adam(5e-3, MultiStepSchedulerConfig(gamma=0.33, milestones=(50, 100)))},
     },
 )
 

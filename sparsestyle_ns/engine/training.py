@@ -2,7 +2,7 @@
 
 import copy
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, Callable, Dict, Iterator, Mapping, Optional, Tuple, Type
 
@@ -10,10 +10,13 @@ import torch
 from jaxtyping import Float
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, OptimizerConfig, Optimizers
+from nerfstudio.engine.schedulers import MultiStepSchedulerConfig, Scheduler
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
 from torch.amp import GradScaler
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleTask
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
@@ -41,6 +44,30 @@ class MuonConfig(OptimizerConfig):
     momentum: float = 0.95
     """Decay of the running mean of gradients."""
     weight_decay: float = 0.0
+
+
+@dataclass
+class WarmUpSchedulerConfig(MultiStepSchedulerConfig):
+    """A learning rate that rises evenly in the first iterations, and falls by a factor at some later ones."""
+
+    _target: Type = field(default_factory=lambda: WarmUpScheduler)
+    warm_up: int = 15
+    """Iterations until it is whole; Adam's first steps are as long as its learning rate, whatever the gradient is."""
+
+
+class WarmUpScheduler(Scheduler):
+    """See `WarmUpSchedulerConfig`."""
+
+    config: WarmUpSchedulerConfig
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
+        """The schedule of an optimiser."""
+
+        def factor(step: int) -> float:
+            falls = sum(step >= milestone for milestone in self.config.milestones)
+            return min(1.0, (step + 1) / max(1, self.config.warm_up)) * self.config.gamma**falls
+
+        return LambdaLR(optimizer, factor)
 
 
 def training_step(

@@ -58,7 +58,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     """T, the iterations in which it falls, as a share of those at a size of the views."""
     content_restart: float = 0.3
     """The share of the content loss's weight with which each size but the first begins."""
-    warm_start_steps: int = 60
+    warm_start_steps: int = 40
     """Steps, before the first iteration, in which c_f is fitted to whole photos; 0 is the paper's start from grey."""
     novel_views: int = 0
     """Views between the photos to stylise as well, with the coarse render as their content."""

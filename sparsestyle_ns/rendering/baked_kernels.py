@@ -16,6 +16,7 @@ NO_CELL = -1
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _SHADE = np.float32(1.0 / 255.0)
 _DEPTH_CAP = np.float32(MAX_OPTICAL_DEPTH)
+_UNSEEN = np.float32(2e-4)  # of a ray's weight: with less, a sample has no colour, only opacity
 _LEAST_DISPARITY = np.float32(0.5 / MAX_DISTANCE)
 _BYTE, _NO_BYTE = np.uint64(255), np.uint64(0)
 _BITS_8, _BITS_16, _BITS_24, _BITS_32, _BITS_40, _BITS_48, _BITS_56 = (np.uint64(8 * byte) for byte in range(1, 8))
@@ -121,10 +122,9 @@ def _words(voxels, i, j, k):
 
 
 @kernel
-def _interpolate(words, fx, fy, fz):
-    """Whether all corners are known, and the trilinear mean of each of their eight bytes."""
+def _corner_weights(fx, fy, fz):
     gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
-    weights = (
+    return (
         gx * gy * gz,
         gx * gy * fz,
         gx * fy * gz,
@@ -134,20 +134,33 @@ def _interpolate(words, fx, fy, fz):
         fx * fy * gz,
         fx * fy * fz,
     )
-    known = True
-    a, b, c, d, e, f, g, h = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+
+
+@kernel
+def _densities(words, weights):
+    """Whether all corners are known, and the trilinear means of their first two bytes, the densities' codes."""
+    known, a, b = True, _ZERO, _ZERO
     for corner in range(8):
         weight, word = weights[corner], words[corner]
         known &= (word & _BYTE) != _NO_BYTE
         a += weight * np.float32(word & _BYTE)
         b += weight * np.float32(word >> _BITS_8 & _BYTE)
+    return known, a, b
+
+
+@kernel
+def _colors(words, weights):
+    """The trilinear means of the corners' other six bytes: the style's colour and the coarse one."""
+    c, d, e, f, g, h = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+    for corner in range(8):
+        weight, word = weights[corner], words[corner]
         c += weight * np.float32(word >> _BITS_16 & _BYTE)
         d += weight * np.float32(word >> _BITS_24 & _BYTE)
         e += weight * np.float32(word >> _BITS_32 & _BYTE)
         f += weight * np.float32(word >> _BITS_40 & _BYTE)
         g += weight * np.float32(word >> _BITS_48 & _BYTE)
         h += weight * np.float32(word >> _BITS_56)
-    return known, (a, b, c, d, e, f, g, h)
+    return c, d, e, f, g, h
 
 
 @kernel
@@ -205,38 +218,45 @@ def march_rays(rays, start, end, lines, voxels, second, shares, min_transmittanc
             u, v, w = _scaled(x, top), _scaled(y, top), _scaled(z, top)
             i, j, k = min(int(u), top - 1), min(int(v), top - 1), min(int(w), top - 1)
             fu, fv, fw = u - np.float32(i), v - np.float32(j), w - np.float32(k)
-            known, code = _interpolate(_words(voxels, i, j, k), fu, fv, fw)
-            style_density, style_r, style_g, style_b = _density(voxels, code[1]), code[2], code[3], code[4]
+            words, near = _words(voxels, i, j, k), _corner_weights(fu, fv, fw)
+            known, code, style_code = _densities(words, near)
+            style_density = _density(voxels, style_code)
             if second is not None:
-                both, other = _interpolate(_words(second, i, j, k), fu, fv, fw)
+                second_words = _words(second, i, j, k)
+                both, _, other_code = _densities(second_words, near)
                 known &= both
-                style_density = _between(style_density, _density(second, other[1]), blend)
-                style_r = _between(style_r, other[2], blend)
-                style_g = _between(style_g, other[3], blend)
-                style_b = _between(style_b, other[4], blend)
+                style_density = _between(style_density, _density(second, other_code), blend)
             if not known:
                 missing[place, lacking] = (i * top + j) * top + k
                 lacking += 1
                 continue
             if lines.bent:
                 length = _length(lines, ray, sample)
-            density = _density(voxels, code[0])
+            density = _density(voxels, code)
             left = _transmitted(density, length, infinite)
-            weight = coarse_light * (_ONE - left)
+            coarse_weight = coarse_light * (_ONE - left)
             coarse_light *= left
-            coarse_r += weight * code[5]
-            coarse_g += weight * code[6]
-            coarse_b += weight * code[7]
-            coarse_opacity += weight
-            coarse_moment += weight * s
             left = _transmitted(_between(density, style_density, density_share), length, infinite)
             weight = light * (_ONE - left)
             light *= left
-            r += weight * _between(code[5], style_r, color_share)
-            g += weight * _between(code[6], style_g, color_share)
-            b += weight * _between(code[7], style_b, color_share)
+            coarse_opacity += coarse_weight
+            coarse_moment += coarse_weight * s
             opacity += weight
             moment += weight * s
+            if max(coarse_weight, weight) < _UNSEEN:
+                continue
+            style_r, style_g, style_b, own_r, own_g, own_b = _colors(words, near)
+            if second is not None:
+                other = _colors(second_words, near)
+                style_r = _between(style_r, other[0], blend)
+                style_g = _between(style_g, other[1], blend)
+                style_b = _between(style_b, other[2], blend)
+            coarse_r += coarse_weight * own_r
+            coarse_g += coarse_weight * own_g
+            coarse_b += coarse_weight * own_b
+            r += weight * _between(own_r, style_r, color_share)
+            g += weight * _between(own_g, style_g, color_share)
+            b += weight * _between(own_b, style_b, color_share)
         sums[ray, 0], sums[ray, 1], sums[ray, 2] = _SHADE * r, _SHADE * g, _SHADE * b
         sums[ray, 3], sums[ray, 4] = opacity, moment
         sums[ray, 5], sums[ray, 6], sums[ray, 7] = _SHADE * coarse_r, _SHADE * coarse_g, _SHADE * coarse_b
