@@ -106,7 +106,7 @@ def test_variants_named_after_the_paper_have_its_settings() -> None:
     assert (level.scale, level.length) == (1.0, 200)
     assert (settings.loss_weights["content"], settings.content_decay) == (10.0, 0.01)
     assert settings.content_share * level.length == 100
-    assert settings.warm_start_steps == 0
+    assert (settings.warm_start_steps, settings.thinning) == (0, 0.0)
     assert style.coarse_method().method_name == "coarse-fewshot-paper"
     assert (model.hash_levels, model.min_resolution, model.max_resolution) == (8, 128, 512)
     assert (model.features_per_level, model.log2_table_size) == (4, 19)

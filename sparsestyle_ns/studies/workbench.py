@@ -13,7 +13,7 @@ from torch import Tensor
 from sparsestyle_ns.data.view_selection import evenly_spaced
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
-from sparsestyle_ns.engine.training import Training
+from sparsestyle_ns.engine.training import Training, WarmUpSchedulerConfig
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.image import image_metrics
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
@@ -51,6 +51,8 @@ def squeezed(config: SparseStyleTrainerConfig, iterations: int) -> SparseStyleTr
             scheduler.max_steps = scaled(scheduler.max_steps)
         elif isinstance(scheduler, MultiStepSchedulerConfig):
             scheduler.milestones = tuple(map(scaled, scheduler.milestones))
+        if isinstance(scheduler, WarmUpSchedulerConfig):
+            scheduler.warm_up = scaled(scheduler.warm_up)
     if isinstance(pipeline, HierStylePipelineConfig):
         pipeline.warm_start_steps = scaled(pipeline.warm_start_steps) if pipeline.warm_start_steps else 0
     return config

@@ -209,9 +209,10 @@ def test_schedules_end_with_the_iterations_there_are():
     assert {group["scheduler"].max_steps for group in coarse.optimizers.values()} == {250}
     preset = method_config("hier-style-draft")
     style = squeezed(preset, 20)
-    assert style.optimizers["fields"]["scheduler"].milestones == (10, 16)
-    assert style.pipeline.warm_start_steps == 15
-    assert preset.pipeline.warm_start_steps == 60
+    scheduler = style.optimizers["fields"]["scheduler"]
+    assert (scheduler.milestones, scheduler.warm_up) == ((10, 16), 4)
+    assert style.pipeline.warm_start_steps == 10
+    assert preset.pipeline.warm_start_steps == 40
     # What is at which size of the views, and how the content weight falls there, is in shares of the iterations.
     ends = [
         (level.scale, config.pipeline.weights_at(level.first + level.length - 1, level)["content"])
