@@ -70,7 +70,7 @@ def measure_cost(options: Options, scene: Scene, coarse_run: Path, side: int, co
 
 
 def plot(points: Dict[str, List[Dict[str, Any]]], path: Path) -> None:
-    """Over pixels: seconds, with bars from the fastest to the slowest repetition, on a logarithmic scale; and memory."""
+    """Over pixels: seconds, with bars from the fastest to the slowest repetition, and peak memory."""
     import matplotlib
 
     matplotlib.use("Agg")
