@@ -134,7 +134,7 @@ def test_a_new_loss_is_trained_measured_and_has_a_flag(runs: SimpleNamespace, mo
     assert told[0].terms()["brightness_loss"] == 0.5 * told[0].values["brightness"]
     assert "brightness" in told[0].metrics()
 
-    view, targets = pipeline.task.views[0].picture, pipeline.targets
+    view, targets = pipeline.task.levels[-1].views[0].picture, pipeline.targets
     figures = stylisation_figures(targets, gram_matrix(targets.style_rows()), view, view.flip(0), None)
     assert figures["brightness_loss"] == pytest.approx(figures["brightness_loss_before"], abs=1e-6)
 
@@ -156,9 +156,9 @@ def test_a_new_feature_network_brings_its_width_and_its_least_side(
     monkeypatch.setitem(BACKBONES, "patches", Patches)
     assert load_backbone("auto", tmp_path / "patches.pth").description.name == "patches"
 
-    training = training_of(runs, backbone="patches")
+    training = training_of(runs, backbone="patches", feature_side=64)  # both sizes in patches of 4
     assert training.step().isfinite()
-    assert training.pipeline.task.views[0].features.shape[1] == 48
+    assert training.pipeline.task.levels[0].views[0].features.shape[1] == 48
     assert training.pipeline.targets.features(torch.rand(1, 40, 3)).shape[2] == 1
 
 

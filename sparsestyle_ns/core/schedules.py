@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Sequence, Tuple
 
 from sparsestyle_ns.utils.errors import InputError
@@ -44,14 +45,15 @@ class Level:
 
 
 def coarse_to_fine(scales: Sequence[float], shares: Sequence[float], total: int) -> Tuple[Level, ...]:
-    """Divides `total` iterations among sizes, each a scale in (0, 1], by shares above 0 whose sum needn't be 1.
+    """Divides `total` iterations among sizes, ascending scales in (0, 1], by shares above 0 whose sum needn't be 1.
 
     Sizes that would get no iteration are left out, but for the last. InputError where scales or shares aren't such.
     """
-    if not scales or len(scales) != len(shares) or not all(0.0 < scale <= 1.0 for scale in scales):
+    ascending = all(scale < larger for scale, larger in pairwise(scales))
+    if not (scales and len(scales) == len(shares) and ascending and all(0.0 < scale <= 1.0 for scale in scales)):
         raise InputError(
             f"Views' scales are {_listed(scales)} and their shares of the iterations {_listed(shares)}: give as many "
-            "shares as scales, and scales above 0 and up to 1."
+            "shares as scales, and scales above 0 and up to 1, each larger than the one before."
         )
     if not all(0.0 < share < math.inf for share in shares):
         raise InputError(f"The scales' shares of the iterations are {_listed(shares)}: give numbers above 0.")

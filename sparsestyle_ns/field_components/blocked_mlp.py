@@ -54,7 +54,8 @@ class _BlockedMLP(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradients: Tensor) -> Tuple[Optional[Tensor], ...]:
-        inputs, parameters = ctx.saved_tensors[: ctx.num_inputs], ctx.saved_tensors[ctx.num_inputs :]
+        saved = ctx.saved_tensors  # once: a checkpointed view gives them no second time
+        inputs, parameters = saved[: ctx.num_inputs], saved[ctx.num_inputs :]
         kept, gradients = None, at_least_float32(gradients)
         if ctx.thinning.threshold > 0:
             kept, gradients = thin(gradients, ctx.thinning)
@@ -78,7 +79,7 @@ class _BlockedMLP(torch.autograd.Function):
         if ctx.needs_input_grad[2]:
             own = torch.cat(first)
             if kept is not None:
-                own = own.new_zeros(ctx.saved_tensors[0].shape).index_copy_(0, kept, own)
+                own = own.new_zeros(saved[0].shape).index_copy_(0, kept, own)
         rest = [None] * (ctx.num_inputs - 1)
         return None, None, own, *rest, *(part.to(like.dtype) for part, like in zip(found, parameters, strict=True))
 

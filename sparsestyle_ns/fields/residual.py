@@ -89,7 +89,7 @@ class ResidualField(nn.Module):
         heads = [self.color_head] if self.density_head is None else [self.color_head, self.density_head]
         logits = blocked_mlp((self.grid.interpolate(location), feature), hidden, heads, self.thinning).float()
         # In half precision a sigmoid reaches 1 at a logit of 6, and has no gradient from there on.
-        color = torch.sigmoid(logits[:, :3])
         if self.density_head is None:
-            return coarse_density, color
-        return fine_density(self.density_scale * logits[:, 3], coarse_density), color
+            return coarse_density, torch.sigmoid(logits)
+        density = fine_density(self.density_scale * logits[:, 3], coarse_density)
+        return density, torch.sigmoid(logits[:, :3])

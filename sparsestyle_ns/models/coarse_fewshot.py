@@ -90,8 +90,8 @@ class CoarseFewShotModel(SceneModel):
         self.step = 0
         self.num_iterations = 1
         self.learns = False
-        self._volume: Optional[DensityVolume] = None
-        self._measured: Tuple[int, ...] = ()
+        # In a tuple: as a module of the model the volume would be part of its state.
+        self._measured: Optional[Tuple[DensityVolume, List[Tuple[int, int]]]] = None
 
     def build_grid(self, effects: Decisions) -> None:
         """Makes the grid that guides samples, or takes it away, as is decided; a new one knows nothing yet."""
@@ -121,7 +121,7 @@ class CoarseFewShotModel(SceneModel):
 
     def finish_learning(self) -> None:
         """From now on pictures are those of a trained field."""
-        self.learns = False
+        self.learns, self._measured = False, None
 
     def update_to_step(self, step: int) -> None:
         """Sets what depends on the iteration: the jitter and the octaves that are revealed."""
@@ -150,11 +150,12 @@ class CoarseFewShotModel(SceneModel):
     @torch.no_grad()
     def marching(self) -> Marching:
         """Where the samples of the trained field lie; its densities are measured if they have changed."""
-        versions = tuple(parameter._version for parameter in self.field.parameters())
-        if self._volume is None or versions != self._measured:
-            self._volume, self._measured = DensityVolume(self.config.volume_resolution).to(self.device), versions
-            self._volume.measure(lambda points: self.field.density_and_feature(points)[0], POINTS_PER_CALL)
-        few = FewSamples(self._volume, self.config.num_eval_samples)
+        versions = [(parameter.data_ptr(), parameter._version) for parameter in self.field.parameters()]
+        if self._measured is None or versions != self._measured[1]:
+            volume = DensityVolume(self.config.volume_resolution).to(self.device)
+            volume.measure(lambda points: self.field.density_and_feature(points)[0], POINTS_PER_CALL)
+            self._measured = volume, versions
+        few = FewSamples(self._measured[0], self.config.num_eval_samples)
         return Marching(None, self.config.num_steps, self.space.unbounded, 0.0, few)
 
     def render_batch(self, segments: Segments, origins: Tensor, directions: Tensor) -> Tuple[DenseRender, Tensor]:

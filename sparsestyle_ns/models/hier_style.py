@@ -37,7 +37,7 @@ class HierStyleModelConfig(FineFieldConfig, SceneModelConfig):
     _target: Type = field(default_factory=lambda: HierStyleModel)
     num_steps: int = 128
     """Even steps along a ray, on which the frozen coarse field is looked at; those in empty cells are skipped."""
-    num_samples: Optional[int] = 6
+    num_samples: Optional[int] = 4
     """Samples a ray on which the stylised field is looked at, where the coarse field's weight is; None: every step
     that can show, as with a fine-tuned copy of the coarse field, whose weight moves."""
     even_share: float = 0.25

@@ -90,6 +90,8 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
 
     def levels(self, iterations: int) -> Tuple[Level, ...]:
         """Which iterations are at which size of the views; InputError where the settings give none."""
+        if not 0.0 < self.content_restart < math.inf:
+            raise InputError(f"--pipeline.content-restart is {self.content_restart}; give a number above 0.")
         return coarse_to_fine(self.view_scales, self.scale_shares, iterations)
 
     def targets_of(

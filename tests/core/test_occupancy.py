@@ -5,7 +5,15 @@ import reference
 import torch
 from nerfstudio.data.scene_box import SceneBox
 
-from sparsestyle_ns.core.occupancy import DensityGrid, Occupancy, PackedSamples, interval_lengths, march
+from sparsestyle_ns.core.occupancy import (
+    LEAST_DENSITY,
+    DensityGrid,
+    DensityVolume,
+    Occupancy,
+    PackedSamples,
+    interval_lengths,
+    march,
+)
 from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace
 from sparsestyle_ns.core.volrend import dense_weights, optical_depth
 
@@ -17,6 +25,13 @@ CUBE = BoxSpace(SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
 def ball(points, radius=0.5):
     """Density of an opaque ball about the origin."""
     return 100.0 * (points.norm(dim=-1) < radius)
+
+
+def measured(density, resolution, chunk=1000):
+    """The volume of a density."""
+    volume = DensityVolume(resolution)
+    volume.measure(density, chunk)
+    return volume
 
 
 def along_x(rays=1):
@@ -133,7 +148,7 @@ def test_the_last_interval_is_infinite_only_in_unbounded_spaces_and_on_rays_that
 @pytest.mark.parametrize("chunk", [1, 700, 10**9])
 def test_measuring_marks_a_ball_and_the_cells_next_to_it(chunk):
     occupancy = Occupancy(12)
-    occupancy.measure(ball, min_alpha=0.01, chunk=chunk)
+    occupancy.measure(measured(ball, 12, chunk), min_alpha=0.01)
     side, marked, near = 2 / 12, 0, 0
     for x in range(12):
         for y in range(12):
@@ -153,8 +168,49 @@ def test_measuring_marks_a_ball_and_the_cells_next_to_it(chunk):
 def test_a_cell_counts_from_the_asked_opacity_over_its_side(factor, expected):
     occupancy = Occupancy(4)
     density = -math.log(1 - 0.3) / (2 / 4)
-    occupancy.measure(lambda points: torch.full((len(points),), factor * density), min_alpha=0.3, chunk=100)
+    volume = measured(lambda points: torch.full((len(points),), factor * density), 4)
+    occupancy.measure(volume, min_alpha=0.3)
     assert occupancy.share == expected
+
+
+def centers(resolution):
+    """The centres of the cells, [x, y, z, 3]."""
+    axis = (torch.arange(resolution) + 0.5) * (2 / resolution) - 1
+    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+
+
+def uneven(points):
+    """A density that differs along all three axes, over several orders of magnitude."""
+    return torch.exp(points @ torch.tensor([3.0, -2.0, 1.0]))
+
+
+@pytest.mark.parametrize("chunk", [1, 30, 10**9])
+def test_a_volume_has_the_densities_of_the_field_at_the_centres_of_its_cells(chunk):
+    points = centers(5)
+    volume = measured(uneven, 5, chunk)
+    torch.testing.assert_close(volume.density(points), uneven(points))
+    torch.testing.assert_close(volume.log_density, uneven(points).log())
+
+
+def test_between_the_centres_the_logarithm_of_the_density_is_linear():
+    volume = measured(uneven, 4)
+    # Of `uneven` the logarithm itself is linear, so that no point within the outer centres is wrong.
+    points = 1.5 * torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) - 0.75
+    torch.testing.assert_close(volume.density(points), uneven(points))
+    # Of two neighbours with 1 and 100 the middle is their geometric mean.
+    volume = measured(lambda points: torch.where(points[:, 0] < 0, 1.0, 100.0), 2)
+    assert volume.density(torch.tensor([[0.0, 0.1, 0.2], [-0.25, 0.0, 0.0]])).tolist() == pytest.approx([10, 10**0.5])
+
+
+def test_outside_of_the_outer_centres_a_volume_goes_on_with_its_border():
+    volume = measured(uneven, 4)
+    points = torch.tensor([[5.0, 0.25, -0.25], [-9.0, -9.0, 9.0], [0.25, 1.0, -0.9]])
+    torch.testing.assert_close(volume.density(points), uneven(points.clamp(-0.75, 0.75)))
+
+
+def test_nothing_is_thinner_in_a_volume_than_what_shows_nowhere():
+    volume = measured(lambda points: torch.zeros(len(points)), 3)
+    assert volume.density(torch.zeros(2, 4, 3)).tolist() == [[pytest.approx(LEAST_DENSITY)] * 4] * 2
 
 
 def test_before_measuring_all_cells_are_occupied():
@@ -163,7 +219,7 @@ def test_before_measuring_all_cells_are_occupied():
 
 def test_marching_keeps_exactly_the_samples_in_occupied_cells(rays):
     occupancy = Occupancy(10)
-    occupancy.measure(ball, min_alpha=0.01, chunk=1000)
+    occupancy.measure(measured(ball, 10), min_alpha=0.01)
     segments = CUBE.segments(*rays)
     samples = march(segments, occupancy, STEPS, unbounded=False)
     expected = []
@@ -199,7 +255,7 @@ def test_rays_that_miss_have_no_samples(rays):
 
 def test_the_last_step_of_an_unbounded_space_is_kept_however_empty(rays):
     occupancy = Occupancy(4)
-    occupancy.measure(lambda points: torch.zeros(len(points)), min_alpha=0.01, chunk=1000)
+    occupancy.measure(measured(lambda points: torch.zeros(len(points)), 4), min_alpha=0.01)
     samples = march(ContractedSpace().segments(*rays), occupancy, STEPS, unbounded=True)
     assert samples.ray_indices.tolist() == list(range(RAYS))
     assert samples.s.tolist() == pytest.approx([1 - 0.5 / STEPS] * RAYS)

@@ -3,7 +3,7 @@ import itertools
 import pytest
 import reference
 
-from sparsestyle_ns.core.schedules import content_weight
+from sparsestyle_ns.core.schedules import Level, coarse_to_fine, content_weight
 from sparsestyle_ns.utils.errors import InputError
 
 
@@ -44,3 +44,52 @@ def test_a_negative_argument_is_refused_by_name(argument, name, value):
     arguments = {"step": 0, "initial": 10.0, "decay": 0.01, "duration": 100} | {argument: value}
     with pytest.raises(InputError, match=rf"content weight's {name}.* is {value}: give a finite number"):
         content_weight(**arguments)
+
+
+def test_iterations_are_divided_by_the_shares_from_small_to_large():
+    assert coarse_to_fine((0.5, 1.0), (0.6, 0.4), 150) == (Level(0.5, 0, 90), Level(1.0, 90, 60))
+    assert coarse_to_fine((1.0,), (7.0,), 33) == (Level(1.0, 0, 33),)
+
+
+@pytest.mark.parametrize("total", [3, 7, 10, 100, 101, 1000])
+@pytest.mark.parametrize("shares", [(1, 1, 1), (3, 2, 1), (0.1, 0.2, 0.7), (1e-9, 1e9, 5e8)])
+def test_the_levels_follow_each_other_and_sum_up_to_all_iterations_however_they_are_rounded(shares, total):
+    levels = coarse_to_fine((0.25, 0.5, 1.0), shares, total)
+    assert sum(level.length for level in levels) == total
+    assert levels[0].first == 0 and levels[-1].scale == 1.0
+    assert all(after.first == level.first + level.length for level, after in itertools.pairwise(levels))
+    # A border is rounded to a whole iteration, and a length is between two borders.
+    lengths = {level.scale: level.length for level in levels}
+    for scale, share in zip((0.25, 0.5, 1.0), shares, strict=True):
+        assert abs(lengths.get(scale, 0) - total * share / sum(shares)) <= 1
+
+
+def test_shares_neednt_sum_up_to_1():
+    assert coarse_to_fine((0.5, 1.0), (3, 2), 150) == coarse_to_fine((0.5, 1.0), (0.6, 0.4), 150)
+
+
+def test_a_size_that_gets_no_iteration_is_left_out_but_the_last_stays():
+    assert coarse_to_fine((0.25, 0.5, 1.0), (0.1, 0.1, 9.8), 4) == (Level(1.0, 0, 4),)
+    assert coarse_to_fine((0.5, 1.0), (0.6, 0.4), 1) == (Level(0.5, 0, 1), Level(1.0, 1, 0))
+    assert coarse_to_fine((0.5, 1.0), (0.6, 0.4), 0) == (Level(1.0, 0, 0),)
+
+
+@pytest.mark.parametrize(
+    ("scales", "shares", "sentence"),
+    [
+        ((), (), "scales are none and their shares of the iterations none"),
+        ((0.5, 1.0), (1.0,), "scales are 0.5 1 and their shares of the iterations 1: give as many shares"),
+        ((0.0, 1.0), (1.0, 1.0), "above 0 and up to 1"),
+        ((0.5, 1.5), (1.0, 1.0), "above 0 and up to 1"),
+        ((float("nan"), 1.0), (1.0, 1.0), "above 0 and up to 1"),
+        ((1.0, 0.5), (1.0, 1.0), "each larger than the one before"),
+        ((0.5, 0.5), (1.0, 1.0), "each larger than the one before"),
+        ((0.5, 1.0), (0.0, 1.0), "shares of the iterations are 0 1: give numbers above 0"),
+        ((0.5, 1.0), (-1.0, 1.0), "give numbers above 0"),
+        ((0.5, 1.0), (float("inf"), 1.0), "give numbers above 0"),
+        ((0.5, 1.0), (float("nan"), 1.0), "give numbers above 0"),
+    ],
+)
+def test_scales_and_shares_that_are_none_are_refused(scales, shares, sentence):
+    with pytest.raises(InputError, match=sentence):
+        coarse_to_fine(scales, shares, 100)

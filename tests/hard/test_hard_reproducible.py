@@ -107,6 +107,7 @@ def go_on(command, method: str, folder: Path, outputs: Path, *flags: str) -> dic
     [
         *(("coarse-fewshot", moment) for moment in trial.MOMENTS),
         ("hier-style", "between two checkpoints"),
+        ("hier-style", "after the last iteration"),  # resumed at the ninth of ten, among the larger views
         ("hier-style", "half way through the second checkpoint"),
     ],
 )

@@ -37,8 +37,8 @@ def checkpoint_of(outputs: Path, method: str) -> Dict[str, Any]:
 
 
 def assert_finite(checkpoint: Dict[str, Any]) -> None:
-    adam = checkpoint["optimizers"]["fields"]["state"].values()
-    tensors = [*checkpoint["pipeline"].values(), *(part for state in adam for part in state.values())]
+    states = [state for optimizer in checkpoint["optimizers"].values() for state in optimizer["state"].values()]
+    tensors = [*checkpoint["pipeline"].values(), *(part for state in states for part in state.values())]
     assert all(tensor.isfinite().all() for tensor in tensors if tensor.is_floating_point())
 
 

@@ -34,6 +34,7 @@ from sparsestyle_ns.core import volrend as compositing
 from sparsestyle_ns.data.scene_info import NDC
 from sparsestyle_ns.effects.layouts import build_space
 from sparsestyle_ns.field_components import (
+    blocked_mlp,
     hash_grid,
     hash_grid_kernels,
     positional_encoding,
@@ -67,6 +68,9 @@ ELSEWHERE = {
     "sparsestyle_ns.losses.style_index.check_style": "refuses, and returns nothing: test_nnfm.py",
     "sparsestyle_ns.style.backbones": "reads weight files: test_vgg.py",
     "sparsestyle_ns.field_components.tiny_cuda_grid.has_tiny_cuda_nn": "asks what is installed: test_hier_style.py",
+    "sparsestyle_ns.rendering.few_samples": "takes a volume of a field's densities: test_few_samples.py",
+    "sparsestyle_ns.rendering.render.frozen_field": "is what freeze_samples and render_frozen call",
+    "sparsestyle_ns.rendering.render.render_frozen": "takes a volume of a field's densities: test_few_samples.py",
     "sparsestyle_ns.rendering.baked.march_compiled": "is what render_baked calls on a CPU",
 }
 """Modules and functions without a property of their own, and why."""
@@ -363,7 +367,8 @@ def test_renders_of_any_field_are_pictures(seed, scene, rays, steps, bias, numbe
         assert (render.accumulation <= 1 + 1e-6).all() and (render.s >= 0).all() and (render.s <= 1 + 1e-5).all()
         depth = volume.surface_distance(segments, render.s)
         assert depth.isfinite().all() and (depth >= 0).all()
-    shaded = baked.shade_of(field, residual, layout, number_format)(2 * torch.rand(5, 3) - 1)
+    with torch.no_grad():
+        shaded = baked.shade_of(field, residual, layout, number_format)(2 * torch.rand(5, 3) - 1)
     assert (shaded >= 0).all() and (shaded[:, 2:] <= 1).all()
     torch.testing.assert_close(volume.accumulation_of(frozen), again.accumulation)
     # What lies behind 1e-3 of the light is left out; bfloat16 rounds logits at the samples of one render alone.
@@ -419,13 +424,33 @@ def test_mixtures_of_fields_lie_between_them(seed, count, strength, geometry, bl
         assert (result >= values.amin(dim=0) * (1 - 1e-5)).all() and (result <= values.amax(dim=0) * (1 + 1e-5)).all()
 
 
-@covers(frozen_view.split_by_samples)
-@given(st.lists(st.integers(0, 1000), max_size=50), st.integers(1, 2000))
-def test_runs_of_rays_are_all_rays_in_order(counts, limit):
-    runs = frozen_view.split_by_samples(torch.tensor(counts, dtype=torch.long), limit)
+@covers(frozen_view.equal_runs)
+@given(st.integers(0, 5000), st.integers(-5, 6000))
+def test_runs_of_rays_are_all_rays_in_order(num_rays, limit):
+    runs = frozen_view.equal_runs(num_rays, limit)
     rays = [ray for run in runs for ray in range(run.start, run.stop)]
-    assert rays == list(range(len(counts)))
-    assert all(sum(counts[run]) <= limit or run.stop - run.start == 1 for run in runs)
+    assert rays == list(range(num_rays))
+    assert all(run.stop - run.start <= max(1, limit) for run in runs)
+
+
+@covers(blocked_mlp.blocked_mlp)
+@given(st.integers(0, 60), st.integers(1, 70), st.integers(0, 5), st.integers(0, 3), st.floats(0, 5), SEEDS)
+def test_blocks_of_points_have_the_values_of_the_layers(count, block, width, depth, threshold, seed):
+    torch.manual_seed(seed)
+    sizes = [width + 2, *[7] * (depth + 1)]
+    hidden = [torch.nn.Linear(*pair, dtype=torch.float64) for pair in itertools.pairwise(sizes)]
+    heads = [torch.nn.Linear(7, channels, dtype=torch.float64) for channels in (3, 1)]
+    inputs = [torch.randn(count, size, dtype=torch.float64) for size in (width, 2)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(blocked_mlp.BLOCK, "cpu", block)
+        thinning = thinned_mlp.Thinning(threshold)
+        found = blocked_mlp.blocked_mlp([inputs[0].requires_grad_(), inputs[1]], hidden, heads, thinning)
+        (gradient,) = torch.autograd.grad(found.square().sum(), inputs[0])
+    values = torch.cat(inputs, dim=-1)
+    for layer in hidden:
+        values = layer(values).relu()
+    torch.testing.assert_close(found, torch.cat([head(values) for head in heads], dim=-1))
+    assert gradient.shape == (count, width) and gradient.isfinite().all()
 
 
 @covers(precision.at_least_float32, precision.without_autocast)

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from nerfstudio.data.scene_box import SceneBox
@@ -7,7 +9,7 @@ from sparsestyle_ns.core.spaces import BoxSpace
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
-from sparsestyle_ns.rendering.frozen_view import FrozenView, split_by_samples
+from sparsestyle_ns.rendering.frozen_view import FrozenView, equal_runs
 from sparsestyle_ns.rendering.render import freeze_samples, render_stylised
 from sparsestyle_ns.rendering.visible_samples import Marching
 
@@ -27,7 +29,7 @@ class Scene:
         self.occupancy.occupied.copy_(torch.rand(6, 6, 6) < 0.7)
         origins = 3 * torch.nn.functional.normalize(torch.randn(RAYS, 3), dim=-1)
         aim = torch.rand(RAYS, 3) * 1.6 - 0.8
-        aim[5:9] += 9
+        aim[5:18:4] += 9
         self.rays = origins, torch.nn.functional.normalize(aim - origins, dim=-1)
         self.target = torch.rand(RAYS, 3)
         self.frozen_runs, self.rendered_chunks = [], 0
@@ -42,9 +44,8 @@ class Scene:
         return render_stylised(self.residual, frozen, torch.ones(3)).rgb
 
     def view(self, max_samples, keep_bytes):
-        counts = torch.bincount(self.freeze(slice(0, RAYS)).samples.ray_indices, minlength=RAYS)
         self.frozen_runs.clear()
-        return FrozenView(split_by_samples(counts, max_samples), self.freeze, keep_bytes)
+        return FrozenView(equal_runs(RAYS, max_samples // STEPS), self.freeze, keep_bytes)
 
     def picture_and_gradients(self, view):
         """The picture, and the gradient of its squared error for each parameter of the residual field."""
@@ -147,22 +148,21 @@ def test_a_chunk_holds_the_samples_of_its_rays(scene):
     assert sum(view.chunk(index).num_rays for index in range(view.num_chunks)) == RAYS
 
 
-@pytest.mark.parametrize("max_samples", [1, 7, 20, 64, 10**6])
-def test_runs_are_consecutive_full_and_not_too_full(max_samples):
-    counts = torch.randint(0, 30, (200,), generator=torch.Generator().manual_seed(0))
-    runs = split_by_samples(counts, max_samples)
+@pytest.mark.parametrize("most", [1, 7, 64, 199, 200, 10**6])
+def test_runs_are_consecutive_as_few_as_can_be_and_of_about_one_length(most):
+    runs = equal_runs(200, most)
     assert [ray for run in runs for ray in range(run.start, run.stop)] == list(range(200))
-    for run, following in zip(runs, [*runs[1:], None], strict=True):
-        total = counts[run].sum()
-        assert total <= max_samples or run.stop - run.start == 1
-        assert following is None or total + counts[following.start] > max_samples
+    assert len(runs) == math.ceil(200 / most)
+    lengths = {run.stop - run.start for run in runs}
+    assert max(lengths) <= most and max(lengths) - min(lengths) <= 1
 
 
 def test_runs_worked_out_by_hand():
-    assert split_by_samples(torch.tensor([2, 2, 1, 9, 0, 4, 0]), 4) == [
-        slice(0, 2),
-        slice(2, 3),
-        slice(3, 4),
-        slice(4, 7),
-    ]
-    assert split_by_samples(torch.tensor([0, 0, 0]), 4) == [slice(0, 3)]
+    assert equal_runs(10, 4) == [slice(0, 3), slice(3, 6), slice(6, 10)]
+    assert equal_runs(8, 4) == [slice(0, 4), slice(4, 8)]
+    assert equal_runs(0, 4) == [slice(0, 0)]
+
+
+@pytest.mark.parametrize("most", [1, 0, -5])
+def test_rays_that_have_more_samples_than_may_be_at_once_come_one_by_one(most):
+    assert equal_runs(3, most) == [slice(0, 1), slice(1, 2), slice(2, 3)]

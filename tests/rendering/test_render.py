@@ -7,7 +7,7 @@ import torch
 from nerfstudio.data.scene_box import SceneBox
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sparsestyle_ns.core.occupancy import Occupancy
+from sparsestyle_ns.core.occupancy import DensityVolume, Occupancy
 from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace
 from sparsestyle_ns.core.volrend import optical_depth, packed_transmittance
@@ -159,7 +159,9 @@ def test_with_coarse_geometry_only_the_colour_is_stylised(coarse, residual, rays
 def test_skipping_cells_that_are_empty_does_not_change_the_picture(ball, residual, rays):
     residual.density_head = None
     occupancy = Occupancy(16)
-    occupancy.measure(lambda points: ball.density_and_feature(points)[0], min_alpha=1e-3, chunk=4096)
+    volume = DensityVolume(16)
+    volume.measure(lambda points: ball.density_and_feature(points)[0], chunk=4096)
+    occupancy.measure(volume, min_alpha=1e-3)
     assert 0 < occupancy.share < 0.5
     everything, skipped = freeze(ball, residual, rays), freeze(ball, residual, rays, occupancy=occupancy)
     assert 0 < len(skipped.density) < 0.7 * len(everything.density)

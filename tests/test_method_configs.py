@@ -1,0 +1,87 @@
+"""What the methods are set to: for people, for a first look, and as the paper has them."""
+
+import pytest
+from nerfstudio.engine.schedulers import MultiStepSchedulerConfig
+
+from sparsestyle_ns.core.schedules import Level, content_weight
+from sparsestyle_ns.engine.training import FusedAdamConfig, MuonConfig
+from sparsestyle_ns.method_configs import method_config
+
+STAGES = ("coarse-fewshot", "hier-style")
+VARIANTS = ("", "-draft", "-paper")
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_variant_of_stage_2_trains_its_own_variant_of_stage_1_where_there_is_no_run(variant):
+    coarse = method_config(f"hier-style{variant}").coarse_method()
+    assert coarse == method_config(f"coarse-fewshot{variant}")
+    assert coarse.method_name == f"coarse-fewshot{variant}"
+    coarse.max_num_iterations = 1  # a copy
+    assert method_config(f"coarse-fewshot{variant}").max_num_iterations > 1
+
+
+def test_methods_are_at_full_size_and_drafts_at_half_of_it():
+    for stage in STAGES:
+        sides = [method_config(stage + variant).pipeline.datamanager.max_image_side for variant in VARIANTS]
+        assert sides == [504, 252, 504]
+
+
+@pytest.mark.parametrize("variant", ["", "-draft"])
+def test_stage_1_learns_matrices_with_muon_and_all_else_with_adam_both_slower_and_slower(variant):
+    config = method_config(f"coarse-fewshot{variant}")
+    kinds = {name: type(group["optimizer"]) for name, group in config.optimizers.items()}
+    assert kinds == {"fields": FusedAdamConfig, "hidden_layers": MuonConfig}
+    for group in config.optimizers.values():
+        assert group["scheduler"].max_steps == config.max_num_iterations
+        assert group["scheduler"].lr_final < group["optimizer"].lr
+
+
+@pytest.mark.parametrize("variant", ["", "-draft"])
+def test_stage_2_goes_from_half_size_to_the_photos(variant):
+    config = method_config(f"hier-style{variant}")
+    small, large = config.pipeline.levels(config.max_num_iterations)
+    assert (small.scale, large.scale) == (0.5, 1.0)
+    assert small.length > large.length > 0 and small.length + large.length == config.max_num_iterations
+
+
+def test_the_papers_stage_1_has_50_000_iterations_of_adam_at_a_constant_rate():
+    config = method_config("coarse-fewshot-paper")
+    assert config.max_num_iterations == 50_000
+    for name in ("fields", "hidden_layers"):
+        optimizer, scheduler = (config.optimizers[name][part] for part in ("optimizer", "scheduler"))
+        assert type(optimizer) is FusedAdamConfig and scheduler is None
+        assert (optimizer.lr, optimizer.betas) == (5e-4, (0.9, 0.999))
+    field = config.pipeline.model.coarse_field
+    assert (field.num_levels, field.num_layers, field.layer_width) == (7, 6, 256)
+
+
+def test_the_papers_stage_2_has_200_iterations_on_whole_photos_whose_rate_falls_at_50_and_100():
+    config = method_config("hier-style-paper")
+    assert config.max_num_iterations == 200
+    optimizer, scheduler = (config.optimizers["fields"][part] for part in ("optimizer", "scheduler"))
+    assert (optimizer.lr, optimizer.betas) == (5e-3, (0.9, 0.999))
+    assert type(scheduler) is MultiStepSchedulerConfig
+    assert (scheduler.gamma, tuple(scheduler.milestones)) == (0.33, (50, 100))
+    assert config.pipeline.levels(200) == (Level(1.0, 0, 200),)
+    assert config.pipeline.warm_start_steps == 0 and config.pipeline.thinning == 0
+
+
+def test_the_papers_content_weight_falls_from_10_to_a_hundredth_in_100_of_200_iterations():
+    settings = method_config("hier-style-paper").pipeline
+    assert settings.content_decay == 0.01 and settings.content_share * 200 == 100
+    (level,) = settings.levels(200)
+    for step in (0, 1, 50, 99, 100, 150, 199):
+        expected = {"content": content_weight(step, 10.0, 0.01, 100), "style": 1.0}
+        assert settings.weights_at(step, level) == pytest.approx(expected)
+
+
+def test_the_papers_methods_add_nothing_to_it():
+    for stage in STAGES:
+        effects = method_config(f"{stage}-paper").pipeline.effects
+        assert effects.view_color == "on" and effects.matched_depth == "off"
+    assert effects.residual_density == "on" and effects.palette == "off"
+    assert method_config("coarse-fewshot-paper").pipeline.model.distortion_weight == 0
+    model = method_config("hier-style-paper").pipeline.model
+    assert (model.hash_levels, model.min_resolution, model.max_resolution) == (8, 128, 512)
+    assert (model.features_per_level, model.log2_table_size) == (4, 19)
+    assert (model.hidden_layers, model.layer_width) == (2, 256)
