@@ -70,7 +70,7 @@ def measure_cost(options: Options, scene: Scene, coarse_run: Path, side: int, co
 
 
 def plot(points: Dict[str, List[Dict[str, Any]]], path: Path) -> None:
-    """Seconds, with bars from the fastest to the slowest repetition, and memory, over pixels; on logarithmic scales."""
+    """Over pixels: seconds, with bars from the fastest to the slowest repetition, and peak memory."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -85,10 +85,12 @@ def plot(points: Dict[str, List[Dict[str, Any]]], path: Path) -> None:
         times.errorbar(pixels, middle, yerr=(below, above), marker="o", capsize=3, label=LABELS[cost])
         memory.plot(pixels, [point["peak_bytes"] / 1e9 for point in found], marker="o", label=LABELS[cost])
     for panel, label in ((times, "seconds"), (memory, "peak memory of the process, GB")):
-        panel.set(xscale="log", yscale="log", xlabel="size of the photos", ylabel=label)
+        panel.set(xscale="log", xlabel="size of the photos", ylabel=label)
         panel.set_xticks(pixels, ["{} × {}".format(*point["size"]) for point in found])
         panel.minorticks_off()
         panel.grid(alpha=0.3)
+    times.set_yscale("log")
+    memory.set_ylim(bottom=0.0)
     times.legend()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
@@ -101,7 +103,7 @@ def main(options: Options) -> None:
     scene = find_scene(options)
     coarse = find_or_train_coarse(scene, options)
     points: Dict[str, List[Dict[str, Any]]] = {cost: [] for cost in COSTS}
-    for side in SIDES[:2] if options.quick else SIDES:
+    for side in SIDES[1:3] if options.quick else SIDES:
         for cost, found in points.items():
             found.append(in_fresh_process(measure_cost, options, scene, coarse.folder, side, cost))
             print(f"  peak {found[-1]['peak_bytes'] / 1e9:.2f} GB", flush=True)
