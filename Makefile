@@ -4,11 +4,13 @@
 #   make test VENV=/path/to/environment  another environment, made there if need be
 #   make demo DEMO="--scene blender"     options of data_scripts/demo.py
 #   make bench BENCH="--quick --sample"  options of all benchmarks
+#   make bench BEFORE=/path/to/worktree  beside an earlier version, too
 
 PYTHON ?= python3
 VENV ?= .venv
 DEMO ?=
 BENCH ?=
+BEFORE ?=
 
 BIN := $(abspath $(VENV))/bin
 READY := $(VENV)/.sparsestyle-installed
@@ -51,6 +53,7 @@ bench: $(READY)
 	done
 	$(BIN)/python -m benchmarks.stability --method coarse-fewshot-draft $(BENCH)
 	$(BIN)/python -m benchmarks.stability --method hier-style-draft $(BENCH)
+	$(if $(BEFORE),$(BIN)/python -m benchmarks.before --before $(BEFORE) $(BENCH))
 	$(BIN)/python -m benchmarks.summary $(BENCH)
 
 $(READY): pyproject.toml constraints.txt | $(BIN)/python

@@ -141,7 +141,9 @@ def find_or_train_coarse(scene: Scene, options: Options) -> CoarseRun:
     if found is None:
         print(f"Training a coarse run of {iterations} iterations, once; it is kept in {folder}", flush=True)
         command = ["-m", "nerfstudio.scripts.train", COARSE_METHOD, "--data", scene.folder, "--output-dir", folder]
-        command += ["--max-num-iterations", iterations, "--optimizers.fields.scheduler.max-steps", iterations]
+        command += ["--max-num-iterations", iterations]
+        for group in ("fields", "hidden_layers"):
+            command += [f"--optimizers.{group}.scheduler.max-steps", iterations]
         command += ["--machine.device-type", device, "--vis", "tensorboard", "--viewer.quit-on-train-completion"]
         command += ["True", *(QUICK_COARSE if options.quick else [])]
         command += ["llff-data"]
@@ -153,13 +155,19 @@ def find_or_train_coarse(scene: Scene, options: Options) -> CoarseRun:
     return found
 
 
-def style_config(scene: Scene, coarse: CoarseRun, longer_side: int, options: Options) -> Any:
-    """The config of hier-style for a scene in a size; with --quick everything is small."""
+def style_config(scene: Scene, coarse: CoarseRun, longer_side: int, options: Options, only_whole: bool = False) -> Any:
+    """The config of hier-style for a scene in a size; with --quick everything is small.
+
+    Args:
+        only_whole: all iterations are at the size of the photos, none at smaller ones.
+    """
     config = at_size(method_config("hier-style"), scene, max(32, longer_side // 8) if options.quick else longer_side)
     pipeline = config.pipeline
     pipeline.style_image, pipeline.backbone = scene.style_image, BACKBONE
     pipeline.model.fine_encoding = "hash"  # the plain way gets the same tables
     pipeline.model.coarse_field = copy.deepcopy(coarse.config.pipeline.model.coarse_field)
+    if only_whole:
+        pipeline.view_scales = pipeline.scale_shares = (1.0,)
     if options.quick:
         pipeline.feature_side, pipeline.warm_start_steps = 64, 1
         pipeline.model.log2_table_size, pipeline.model.occupancy_resolution = 12, 16
@@ -265,13 +273,13 @@ class PlainTraining:
 
     def step(self) -> None:
         """One iteration: one whole view (Eq. 5)."""
-        settings, pixels = self.pipeline.config, self.pipeline.datamanager.pixels
+        schedule, targets, views = self.pipeline.task.level(self.num_steps)
+        pixels = self.pipeline.datamanager.pixels_at(schedule.scale)
         index = self.num_steps % len(pixels.sizes)
-        view, rows = self.pipeline.task.views[index], slice(pixels.starts[index], pixels.starts[index + 1])
+        view, rows = views[index], pixels.rows(index)
         self.optimizer.zero_grad()
         image = self.field.render(pixels.origins[rows], pixels.directions[rows]).view(view.picture.shape)
-        targets = self.pipeline.targets
         values = targets.losses(targets.view(image, view.features, view.accumulation))
-        sum(Losses(values, settings.weights_at(self.num_steps)).terms().values()).backward()
+        sum(Losses(values, self.pipeline.config.weights_at(self.num_steps, schedule)).terms().values()).backward()
         self.optimizer.step()
         self.num_steps += 1

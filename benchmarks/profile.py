@@ -17,7 +17,7 @@ from sparsestyle_ns.utils.errors import exit_on_input_error
 STAGE_1_SIDE, STAGE_2_SIDE = 126, 252
 PARTS: Tuple[Tuple[str, str], ...] = (
     ("hash grid", r"_Fused"),
-    ("thinned layers, without their products", r"_ThinnedMLP"),
+    ("layers in blocks or thinned, without their products", r"_ThinnedMLP|_BlockedMLP"),
     ("feature network's convolutions and pooling", r"conv|pool2d"),
     ("matrix products", r"::(mm|addmm|bmm|linear|matmul)$|mkldnn_linear"),
     ("optimiser", r"[Aa]dam|[Oo]ptimizer"),
@@ -72,7 +72,7 @@ def main(options: Options) -> None:
     side = STAGE_1_SIDE // 4 if options.quick else STAGE_1_SIDE
     stage_1 = Training(at_size(method_config(COARSE_METHOD), scene, side), report.device)
     coarse = find_or_train_coarse(scene, options)
-    config = style_config(scene, coarse, STAGE_2_SIDE, options)
+    config = style_config(scene, coarse, STAGE_2_SIDE, options, only_whole=True)
     config.pipeline.warm_start_steps = 0
     warm_up, steps = (2, 2) if options.quick else (50, 50)
     found = {"stage 1": profiled(stage_1, warm_up, steps)}

@@ -1,122 +1,117 @@
-"""How the costs of stage 2 grow with pixels, samples, views and levels of the hash grid. Ours alone, no peer."""
+"""How time and memory of stage 2 grow with the photos' size: an iteration, an exact view, and freezing. Ours alone.
+
+Each cost of each size has a process of its own, whose peak memory is that of this work, with torch and the scene.
+"""
 
 import math
 import statistics
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Tuple
 
+import torch
 import tyro
 
-from benchmarks._measure import Options, Report, alternate, timed
-from benchmarks._scene import find_or_train_coarse, find_scene, style_config
+from benchmarks._measure import RESULTS, ROOT, Options, Report, alternate, in_fresh_process, peak_bytes, timed
+from benchmarks._scene import Scene, find_or_train_coarse, find_scene, style_config
 from sparsestyle_ns.engine.training import Training
-from sparsestyle_ns.runs.coarse_run import CoarseRun
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
+from sparsestyle_ns.runs.coarse_run import CoarseRun, read_coarse_run
 from sparsestyle_ns.utils.errors import exit_on_input_error
 
-SIDE = 126
-COSTS = {"step": "one iteration", "render": "one view, exact", "prepare": "freezing all views"}
-LABELS = {
-    "pixels": "pixels of a view",
-    "samples": "steps along a ray",
-    "views": "photos",
-    "levels": "levels of the hash grid",
-}
+SIDES = (126, 252, 504, 1008)
+PLOT = ROOT / "docs" / "images" / "scaling_fern.png"
+Prepared = Tuple[HierStylePipeline, Callable[[], Any]]
 
 
-def set_side(config: Any, side: int) -> None:
-    """Longer side of the photos."""
-    config.pipeline.datamanager.max_image_side = side
+def prepare_step(config: Any, coarse: CoarseRun, device: torch.device) -> Prepared:
+    """Whole iterations at the photos' size."""
+    training = Training(config, device, coarse.model_state())
+    return training.pipeline, training.step
 
 
-def set_samples(config: Any, num_steps: int) -> None:
-    """Steps along a ray."""
-    config.pipeline.model.num_steps = num_steps
+def prepare_view(config: Any, coarse: CoarseRun, device: torch.device) -> Prepared:
+    """Exact renders of a held-out view."""
+    pipeline = _untrained(config, coarse, device)
+    camera = pipeline.datamanager.eval_dataset.cameras[:1].to(device)
+    return pipeline, lambda: pipeline.model.get_outputs_for_camera(camera)
 
 
-def set_views(config: Any, num_views: int) -> None:
-    """Photos to stylise."""
-    config.pipeline.datamanager.num_views = num_views
+def prepare_freezing(config: Any, coarse: CoarseRun, device: torch.device) -> Prepared:
+    """Freezing all views, at the photos' size."""
+    pipeline = _untrained(config, coarse, device)
+    return pipeline, pipeline.freeze_views
 
 
-def set_levels(config: Any, hash_levels: int) -> None:
-    """Levels of the hash grid."""
-    config.pipeline.model.hash_levels = hash_levels
+def _untrained(config: Any, coarse: CoarseRun, device: torch.device) -> HierStylePipeline:
+    pipeline = config.pipeline.setup(device=str(device), test_mode="val")
+    pipeline.model.adopt_coarse(coarse.model_state())
+    return pipeline.eval()
 
 
-AXES: Dict[str, Tuple[Callable[[Any, int], None], Tuple[int, ...]]] = {
-    "pixels": (set_side, (63, 126, 252, 504)),
-    "samples": (set_samples, (32, 64, 128, 256)),
-    "views": (set_views, (1, 2, 4, 8)),
-    "levels": (set_levels, (2, 4, 8, 16)),
-}
+COSTS = {"step": prepare_step, "view": prepare_view, "freezing": prepare_freezing}
+LABELS = {"step": "one iteration", "view": "one view, exact", "freezing": "freezing all views"}
 
 
-def measure_costs(config: Any, coarse: CoarseRun, report: Report) -> Dict[str, Any]:
-    """Pixels of a view, what the views take in memory, and seconds of each repetition for each of `COSTS`."""
-    training = Training(config, report.device, coarse.model_state())
-    pipeline = training.pipeline
-    camera = pipeline.datamanager.eval_dataset.cameras[:1].to(report.device)
-    work = {
-        "step": training.step,
-        "render": lambda: pipeline.model.get_outputs_for_camera(camera),
-        "prepare": pipeline.freeze_views,
-    }
-    measures = {name: timed(function, report.device) for name, function in work.items()}
-    found = alternate(measures, report.options.repetitions(3))
-    seconds: Dict[str, Any] = {name: [one.seconds for one in durations] for name, durations in found.items()}
+def measure_cost(options: Options, scene: Scene, coarse_run: Path, side: int, cost: str) -> Dict[str, Any]:
+    """Seconds of each repetition, the process's peak memory, and the size of a view."""
+    device = options.set_up()
+    coarse = read_coarse_run(coarse_run)
+    config = style_config(scene, coarse, side, options, only_whole=True)
+    config.pipeline.warm_start_steps = 0
+    pipeline, work = COSTS[cost](config, coarse, device)
+    found = alternate({f"{cost}, {side}": timed(work, device)}, options.repetitions(3))
+    cameras = pipeline.datamanager.train_dataset.cameras
     return {
-        "pixels": math.prod(pipeline.datamanager.pixels.sizes[0]),
-        "kept_bytes": sum(view.frozen.kept_bytes for view in pipeline.task.views),
-        "seconds": seconds,
+        "size": [int(cameras.width[0]), int(cameras.height[0])],
+        "views": len(cameras),
+        "seconds": [duration.seconds for durations in found.values() for duration in durations],
+        "peak_bytes": peak_bytes(device),
     }
 
 
 def plot(points: Dict[str, List[Dict[str, Any]]], path: Path) -> None:
-    """Draws medians, with bars from the fastest to the slowest repetition; both scales are logarithmic."""
+    """Seconds, with bars from the fastest to the slowest repetition, and memory, over pixels; on logarithmic scales."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, panels = pyplot.subplots(1, len(points), figsize=(4 * len(points), 3.6), sharey=True, layout="constrained")
-    for panel, (axis, found) in zip(panels, points.items(), strict=True):
-        values = [point["value"] for point in found]
-        for cost, label in COSTS.items():
-            seconds = [point["seconds"][cost] for point in found]
-            middle = [statistics.median(one) for one in seconds]
-            below = [center - min(one) for center, one in zip(middle, seconds, strict=True)]
-            above = [max(one) - center for center, one in zip(middle, seconds, strict=True)]
-            panel.errorbar(values, middle, yerr=(below, above), marker="o", capsize=3, label=label)
-        panel.set(xscale="log", yscale="log", xlabel=LABELS[axis])
-        panel.set_xticks(values, [f"{value:,}" for value in values], rotation=30)
+    figure, (times, memory) = pyplot.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
+    for cost, found in points.items():
+        pixels = [math.prod(point["size"]) for point in found]
+        middle = [statistics.median(point["seconds"]) for point in found]
+        below = [center - min(point["seconds"]) for center, point in zip(middle, found, strict=True)]
+        above = [max(point["seconds"]) - center for center, point in zip(middle, found, strict=True)]
+        times.errorbar(pixels, middle, yerr=(below, above), marker="o", capsize=3, label=LABELS[cost])
+        memory.plot(pixels, [point["peak_bytes"] / 1e9 for point in found], marker="o", label=LABELS[cost])
+    for panel, label in ((times, "seconds"), (memory, "peak memory of the process, GB")):
+        panel.set(xscale="log", yscale="log", xlabel="size of the photos", ylabel=label)
+        panel.set_xticks(pixels, ["{} × {}".format(*point["size"]) for point in found])
         panel.minorticks_off()
         panel.grid(alpha=0.3)
-    panels[0].set_ylabel("seconds")
-    panels[0].legend()
+    times.legend()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
 
 
 @exit_on_input_error
 def main(options: Options) -> None:
-    """Measures along each axis, the others being those of hier-style, and draws what it finds."""
+    """Measures each cost at each size, the settings being those of hier-style, and draws what it finds."""
     report = Report("scaling", options)
     scene = find_scene(options)
     coarse = find_or_train_coarse(scene, options)
-    points: Dict[str, List[Dict[str, Any]]] = {}
-    for axis, (change, values) in AXES.items():
-        for value in values[:1] if options.quick else values:
-            config = style_config(scene, coarse, SIDE, options)
-            config.pipeline.warm_start_steps = 0
-            change(config, value)
-            print(f"{axis}: {value}", flush=True)
-            found = measure_costs(config, coarse, report)
-            value = found["pixels"] if axis == "pixels" else value
-            points.setdefault(axis, []).append({"value": value, **found})
-    report.extra["settings"] = {"side": SIDE}
+    points: Dict[str, List[Dict[str, Any]]] = {cost: [] for cost in COSTS}
+    for side in SIDES[:2] if options.quick else SIDES:
+        for cost, found in points.items():
+            found.append(in_fresh_process(measure_cost, options, scene, coarse.folder, side, cost))
+            print(f"  peak {found[-1]['peak_bytes'] / 1e9:.2f} GB", flush=True)
     report.extra["points"] = points
-    report.notes.append(f"Each axis with the defaults of hier-style otherwise, photos of {SIDE} pixels.")
-    plot(points, report.write().with_suffix(".png"))
+    report.notes.append(
+        "Settings of hier-style, all iterations at the photos' size. Each cost of each size in a process of its own; "
+        "its peak is resident memory on a CPU, what torch allocated on a GPU."
+    )
+    path = report.write().with_suffix(".png")
+    plot(points, PLOT if path.parent == RESULTS else path)
 
 
 if __name__ == "__main__":

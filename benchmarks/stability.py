@@ -1,7 +1,8 @@
 """The largest learning rate at which a method still trains: its default, doubled until training fails.
 
 A rate is stable where no step has to be skipped for a gradient that isn't finite, and the loss ends at most half as
-high again as at the default. The rate stays the same all along, without the method's schedule.
+high again as at the default. The rate stays the same all along, without the method's schedule. Where a method has
+several groups of parameters, all their rates are doubled together, and the one that is named is that of its fields.
 """
 
 import copy
@@ -72,16 +73,18 @@ def largest_stable(trials: List[Trial]) -> float:
     return stable
 
 
-def attempt(config: Any, coarse: Optional[CoarseRun], rate: float, iterations: int, device: torch.device) -> Trial:
-    """Trains at one rate."""
+def attempt(config: Any, coarse: Optional[CoarseRun], factor: int, iterations: int, device: torch.device) -> Trial:
+    """Trains at so many times the default rates."""
     config = copy.deepcopy(config)
-    config.optimizers["fields"] = {**config.optimizers["fields"], "scheduler": None}
-    config.optimizers["fields"]["optimizer"].lr = rate
+    config.max_num_iterations = iterations
+    for group in config.optimizers.values():
+        group["scheduler"] = None
+        group["optimizer"].lr *= factor
     torch.manual_seed(0)
     training = Training(config, device, None if coarse is None else coarse.model_state())
     losses = [training.step().item() for _ in range(iterations)]
     last = losses[-max(1, round(LAST * iterations)) :]
-    return Trial(rate, sum(last) / len(last), training.optimizers.skipped()[0])
+    return Trial(config.optimizers["fields"]["optimizer"].lr, sum(last) / len(last), training.optimizers.skipped()[0])
 
 
 @exit_on_input_error
@@ -101,7 +104,7 @@ def main(options: StabilityOptions) -> None:
     default = config.optimizers["fields"]["optimizer"].lr
     trials: List[Trial] = []
     for doubling in range((1 if options.quick else options.doublings) + 1):
-        trials.append(attempt(config, coarse, default * 2**doubling, iterations, report.device))
+        trials.append(attempt(config, coarse, 2**doubling, iterations, report.device))
         print(f"  {trials[-1].rate:<10.4g} loss {trials[-1].loss:.4g}, {trials[-1].skipped} steps skipped", flush=True)
         if largest_stable(trials) < trials[-1].rate:
             break

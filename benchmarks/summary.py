@@ -17,6 +17,7 @@ BENCHMARKS = (
     "nnfm",
     "stage2_step",
     "render",
+    "before",
     "memory",
 )
 """In the order of the table."""

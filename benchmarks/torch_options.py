@@ -103,7 +103,7 @@ def residual_works(count: int, device: torch.device) -> Dict[str, Work]:
         found = torch.autograd.grad(fine.mean() + color.square().mean(), parameters)
         return torch.cat([gradient.flatten() for gradient in found])
 
-    return _field_works(field, work, device)
+    return _field_works(field, work, "forward", device)
 
 
 def coarse_works(count: int, device: torch.device) -> Dict[str, Work]:
@@ -117,15 +117,15 @@ def coarse_works(count: int, device: torch.device) -> Dict[str, Work]:
             density, feature = module.density_and_feature(positions)
         return torch.cat([density[:, None], feature.float()], dim=-1).flatten()
 
-    return _field_works(field, work, device)
+    return _field_works(field, work, "_evaluate", device)
 
 
-def _field_works(field: nn.Module, work: Callable[..., Tensor], device: torch.device) -> Dict[str, Work]:
+def _field_works(field: nn.Module, work: Callable[..., Tensor], function: str, device: torch.device) -> Dict[str, Work]:
     works: Dict[str, Work] = {USUAL: lambda: work(field, lambda: autocast(device, "auto"))}
     for name, context in formats(device).items():
         works[name] = lambda context=context: work(field, context)
     for name, settings in compilers(device).items():
-        module = compiled(field, ["_evaluate"], **settings)
+        module = compiled(field, [function], **settings)
         works[name] = lambda module=module: work(module, lambda: autocast(device, "auto"))
     return works
 

@@ -155,6 +155,7 @@ def runs(llff_scene: Path, painting: Path, tmp_path_factory: pytest.TempPathFact
 @pytest.fixture(scope="session")
 def patterned_run(runs: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The stylised run, which a few iterations left grey all over, with weights that make shapes and colours."""
+    from sparsestyle_ns.engine.loading import load_run
     from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 
     outputs = tmp_path_factory.mktemp("outputs")
@@ -174,5 +175,9 @@ def patterned_run(runs: SimpleNamespace, tmp_path_factory: pytest.TempPathFactor
             value.copy_(3.0 * torch.randn(value.shape, generator=generator))
         if name == "_model.residual.color_head.weight":
             value *= 6.0
+    torch.save(state, path)
+    model = load_run(folder / "config.yml").pipeline.model
+    model.volume.measure(lambda points: model.field.density_and_feature(points)[0], chunk=4096)
+    state["pipeline"]["_model.volume.log_density"] = model.volume.log_density  # of these weights
     torch.save(state, path)
     return folder

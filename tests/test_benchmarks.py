@@ -13,7 +13,19 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))  # benchmarks isn't in
 
 from nerfstudio.data.scene_box import SceneBox
 
-from benchmarks import _measure, _scene, effects, nnfm, profile, stability, stage1, summary, torch_options
+from benchmarks import (
+    _measure,
+    _scene,
+    before,
+    effects,
+    nnfm,
+    profile,
+    scaling,
+    stability,
+    stage1,
+    summary,
+    torch_options,
+)
 from benchmarks._measure import Duration, Options, Ratio, Report
 from sparsestyle_ns.core.occupancy import Occupancy
 from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace
@@ -398,6 +410,57 @@ def test_stage_1_is_compared_with_fields_that_look_at_every_sample(monkeypatch):
     assert (even.effects.empty_space, dense.effects.empty_space) == ("off", "off")
     assert even.model.num_samples == dense.model.num_samples == stage1.EVEN_SAMPLES
     assert even.model.thinning > 0 and dense.model.thinning == 0
+
+
+# --------------------------------------------------------------------------------------------------- earlier versions
+
+
+class FakeVersion:
+    """Says of each piece of work that it took these seconds, one after another."""
+
+    def __init__(self, **seconds):
+        self.seconds = {name: iter(values) for name, values in seconds.items()}
+
+    def ask(self, line):
+        if line == "facts":
+            return {"coarse_iterations": 1000, "warm_start_steps": 10, "style_iterations": 100, "size": [8, 6]}
+        return {"seconds": next(self.seconds[line])}
+
+
+def test_an_earlier_versions_whole_is_its_seconds_an_iteration_times_its_iterations(options):
+    options.repeats = 3
+    warm_up = [9.0] * (before.WARM_COARSE_STEPS + 1)
+    version = FakeVersion(
+        coarse_step=[*warm_up, 0.5, 0.25, 1.0], warm_start_step=[9.0, 1.0, 2.0, 3.0], style_step=[9.0, 4.0, 4.0, 5.0]
+    )
+    found = before.extrapolate(version, Report("before", options))
+    assert found["iterations"] == {"coarse_step": 1000, "warm_start_step": 10, "style_step": 100}
+    assert found["seconds"] == {"median": 500 + 20 + 400, "least": 250 + 10 + 400, "most": 1000 + 30 + 500}
+
+
+def test_an_earlier_version_that_isnt_one_is_said(tmp_path):
+    with pytest.raises(SystemExit, match="has no sparsestyle_ns; name a git worktree"):
+        before.main(before.BeforeOptions(before=tmp_path, device="cpu"))
+
+
+def test_a_version_that_ends_before_it_answers_is_said(tmp_path, monkeypatch):
+    script = tmp_path / "worker.py"
+    script.write_text("import sys\nfor line in sys.stdin:\n    print(len(line), flush=True)\n    break\n")
+    monkeypatch.setattr(before, "WORKER", script)
+    version = before.Version(tmp_path, {"threads": 1})
+    assert version.ask("abc") == 4
+    with pytest.raises(InputError, match="couldn't do abc"):
+        version.ask("abc")
+    version.end()
+
+
+def test_costs_are_drawn_over_the_size_of_the_photos(tmp_path):
+    points = [
+        {"size": [side, side * 3 // 4], "seconds": [side / 100, side / 90], "peak_bytes": side * 10**7}
+        for side in scaling.SIDES
+    ]
+    scaling.plot({cost: points for cost in scaling.COSTS}, tmp_path / "images" / "scaling.png")
+    assert (tmp_path / "images" / "scaling.png").stat().st_size > 1000
 
 
 # ---------------------------------------------------------------------------------------------------------- stability

@@ -30,7 +30,9 @@ from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 from sparsestyle_ns.runs.coarse_run import read_coarse_run
 from sparsestyle_ns.style import vgg
 
-METHODS = ("coarse-fewshot", "coarse-fewshot-draft", "hier-style", "hier-style-draft")
+METHODS = tuple(
+    f"{method}{variant}" for method in ("coarse-fewshot", "hier-style") for variant in ("", "-draft", "-paper")
+)
 HASH_TABLE = "_model.residual.grid.table"
 
 
@@ -86,22 +88,35 @@ def test_drafts_are_the_same_methods_with_other_numbers() -> None:
         assert draft.pipeline.datamanager.max_image_side < full.pipeline.datamanager.max_image_side
 
 
-def test_the_defaults_are_the_papers() -> None:
-    coarse, style = method_config("coarse-fewshot"), method_config("hier-style")
+def test_variants_named_after_the_paper_have_its_settings() -> None:
+    coarse, style = method_config("coarse-fewshot-paper"), method_config("hier-style-paper")
     assert coarse.max_num_iterations == 50_000
-    assert coarse.optimizers["fields"]["optimizer"].lr == 5e-4
-    assert coarse.optimizers["fields"]["scheduler"] is None
+    assert coarse.pipeline.datamanager.train_num_rays_per_batch == 1024
+    for group in coarse.optimizers.values():
+        assert type(group["optimizer"]).__name__ == "FusedAdamConfig"
+        assert (group["optimizer"].lr, group["scheduler"]) == (5e-4, None)
+    assert coarse.pipeline.model.distortion_weight == 0.0
     field = coarse.pipeline.model.coarse_field
     assert (field.num_levels, field.num_layers) == (7, 6)
     optimizer, scheduler = (style.optimizers["fields"][part] for part in ("optimizer", "scheduler"))
     assert (optimizer.lr, optimizer.betas) == (5e-3, (0.9, 0.999))
     assert (scheduler.gamma, scheduler.milestones) == (0.33, (50, 100))
     settings, model = style.pipeline, style.pipeline.model
-    assert (settings.loss_weights["content"], settings.content_decay, settings.content_steps) == (10.0, 0.01, 100)
+    (level,) = settings.levels(style.max_num_iterations)
+    assert (level.scale, level.length) == (1.0, 200)
+    assert (settings.loss_weights["content"], settings.content_decay) == (10.0, 0.01)
+    assert settings.content_share * level.length == 100
+    assert (settings.warm_start_steps, settings.thinning) == (0, 0.0)
+    assert style.coarse_method().method_name == "coarse-fewshot-paper"
     assert (model.hash_levels, model.min_resolution, model.max_resolution) == (8, 128, 512)
     assert (model.features_per_level, model.log2_table_size) == (4, 19)
     assert (model.hidden_layers, model.layer_width) == (2, 256)
-    assert {getattr(settings.effects, name) for name in EFFECTS} == {"auto"}
+
+
+def test_by_default_effects_are_decided_by_the_scene() -> None:
+    for method in ("coarse-fewshot", "hier-style", "coarse-fewshot-draft", "hier-style-draft"):
+        effects = method_config(method).pipeline.effects
+        assert {getattr(effects, name) for name in EFFECTS} == {"auto"}
 
 
 def test_the_views_in_use_are_saved_with_the_run(runs: SimpleNamespace) -> None:
@@ -119,6 +134,7 @@ def test_a_stylised_checkpoint_holds_the_whole_scene_and_nothing_else(runs: Simp
     assert set(style) == fields | {
         "_model.device_indicator_param",
         "_model.occupancy.occupied",
+        "_model.volume.log_density",
         HASH_TABLE,
         *(f"_model.residual.mlp.layers.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")),
         *(f"_model.residual.{head}_head.{part}" for head in ("color", "density") for part in ("weight", "bias")),

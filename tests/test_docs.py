@@ -22,6 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 METHODS = ("coarse-fewshot", "hier-style")
+VARIANT = re.compile("-(draft|paper)$")
 FLAG = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
 LINK = re.compile(r"!?\[[^\]]*\]\(([^()\s]+)\)")
 INLINE_CODE = re.compile(r"`([^`]+)`")
@@ -139,7 +140,7 @@ def nerfstudio_flags(program: str) -> Set[str]:
 def unknown_flags(command: Command) -> Set[str]:
     """The command's flags that it doesn't have."""
     words = command.words
-    if command.named("ns-train") and words[1].removesuffix("-draft") in METHODS:
+    if command.named("ns-train") and VARIANT.sub("", words[1]) in METHODS:
         position = words.index("llff-data") if "llff-data" in words else len(words)
         before, after = Command(words[:position]), Command(words[position:])
         return (before.flags - method_flags(words[1])) | (after.flags - class_flags("LLFFDataParserConfig"))
@@ -200,7 +201,7 @@ def test_commands_and_their_flags_exist(page: Path) -> None:
         if command.named("make"):
             assert words[1] in make_targets, words
         if command.named("ns-train") and not words[1].startswith("-"):
-            assert words[1].removesuffix("-draft") in METHODS, words
+            assert VARIANT.sub("", words[1]) in METHODS, words
         if command.named("sparsestyle"):
             assert words[1] in subcommands(), words
         if command.named("python") and words[1] != "-m":

@@ -34,11 +34,9 @@ def results(run_folder: Path, output: Path) -> Dict[str, float]:
     return json.loads(output.read_text())["results"]
 
 
-@pytest.mark.parametrize(
-    "scene, parser, side", [("llff/fern", "llff-data", 126), ("blender/lego", "blender-data", 100)]
-)
-def test_the_drafts_find_surfaces_and_paint_them(scene, parser, side, tmp_path):
-    common = ["--data", DATA / scene, "--output-dir", tmp_path, "--max-image-side", side]
+@pytest.mark.parametrize("scene, parser", [("llff/fern", "llff-data"), ("blender/lego", "blender-data")])
+def test_the_drafts_find_surfaces_and_paint_them(scene, parser, tmp_path):
+    common = ["--data", DATA / scene, "--output-dir", tmp_path]
     common += ["--vis", "tensorboard", "--viewer.quit-on-train-completion", "True"]
     run("ns-train", "coarse-fewshot-draft", *common, parser)
     coarse = results(only_run(tmp_path, "coarse-fewshot-draft"), tmp_path / "coarse.json")

@@ -22,7 +22,7 @@ from sparsestyle_ns.core.volrend import dense_weights, effective_samples, optica
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID
 from sparsestyle_ns.metrics.consistency import RANGES, PathGeometry
-from sparsestyle_ns.metrics.image import gram_distance, gram_matrix, image_metrics, psnr
+from sparsestyle_ns.metrics.image import gram_distance, gram_matrix, image_metrics, psnr, structural_similarity
 from sparsestyle_ns.metrics.warping import MIN_COVERAGE, Pinhole, Surface
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
@@ -139,7 +139,7 @@ class _StyleMeasure:
     def view(self, outputs: Dict[str, Tensor], photo: Tensor, camera: Cameras) -> Dict[str, float]:
         model, coarse, stylised = self.model, outputs["rgb_coarse"], outputs["rgb"]
         values = {f"coarse_{key}": value for key, value in image_metrics(coarse, photo).items()}
-        values["content_ssim"] = image_metrics(stylised, photo)["ssim"]
+        values["content_ssim"] = structural_similarity(stylised, photo)
         if self.targets is not None:
             covered = None if model.background is None else outputs["accumulation"].squeeze(-1)
             values.update(stylisation_figures(self.targets, self.style_gram, coarse, stylised, covered))

@@ -1,7 +1,8 @@
 """A stylised scene as bytes on a voxel grid: what a page carries, and how its renderer reads it.
 
-σ_f and c_f depend on the position alone, so that a grid of them is the scene. The page's renderer (raymarch.frag) takes
-the exact render's steps through it; `render_voxels` is that renderer in torch, by which the page's error is measured.
+σ_f and c_f depend on the position alone, so that a grid of them is the scene. The page's renderer (raymarch.frag) goes
+through it in even steps, as baked rendering does; `render_voxels` is that renderer in torch, by which the page's error
+against the exact render is measured.
 """
 
 import copy

@@ -18,7 +18,7 @@ from sparsestyle_ns.evaluation.tables import Table, report_tables, table_of
 from sparsestyle_ns.gallery.film import as_pixels, make_film, read_film
 from sparsestyle_ns.gallery.gallery_options import GalleryOptions
 from sparsestyle_ns.gallery.layout import Film, Picture, RunPictures, View, gallery_page, thumbnail
-from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
+from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig
 from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
@@ -78,7 +78,7 @@ def collect_run(
         style_note=f"The style image, {painting}, is no longer there.",
         film=film,
         tables=[_views_table(measured)] if report is None else report_tables(report.means, len(report.views)),
-        settings=_settings(config, dataset, step),
+        settings=_settings(config, dataset, pipeline.datamanager.photo_side, step),
         effects=pipeline.effects.rows(),
     )
 
@@ -155,11 +155,18 @@ def _views_table(views: Sequence[Dict[str, float]]) -> Table:
     return table_of(f"Mean of the views above, {len(views)}", columns, [("", means)])
 
 
-def _settings(config: TrainerConfig, dataset: PhotoDataset, step: int) -> List[Tuple[str, str]]:
-    pipeline = config.pipeline
+def _settings(config: TrainerConfig, dataset: PhotoDataset, photo_side: int, step: int) -> List[Tuple[str, str]]:
+    pipeline: HierStylePipelineConfig = config.pipeline
     height, width = int(dataset.cameras.height[0]), int(dataset.cameras.width[0])
-    first = pipeline.loss_weights["content"]
-    last = first * pipeline.content_decay
+    side, weight = pipeline.feature_side or photo_side, pipeline.loss_weights["content"]
+    sizes, weights = [], []
+    for level in pipeline.levels(config.max_num_iterations):
+        sizes.append(f"{round(level.scale * side)} pixels in {level.length} iterations")
+        first, last = (
+            pipeline.weights_at(at, level)["content"] if weight > 0 else 0.0
+            for at in (level.first, level.first + level.length)
+        )
+        weights.append(f"{first:g} to {last:g} in {round(pipeline.content_share * level.length)} iterations")
     return [
         ("Method", config.method_name),
         ("Made", config.timestamp),
@@ -169,7 +176,7 @@ def _settings(config: TrainerConfig, dataset: PhotoDataset, step: int) -> List[T
         ("Coarse run", "none" if pipeline.coarse_run is None else pipeline.coarse_run.name),
         ("Style image", "none" if pipeline.style_image is None else pipeline.style_image.name),
         ("Feature network", pipeline.backbone if pipeline.vgg_weights is None else pipeline.vgg_weights.name),
-        ("Size it sees views at", f"{pipeline.feature_side} pixels"),
-        ("Content weight λ", f"{first:g} to {last:g} in {pipeline.content_steps} iterations"),
+        ("Size it sees views at", ", then ".join(sizes)),
+        ("Content weight λ", ", then ".join(weights)),
         ("Warm start", f"{pipeline.warm_start_steps} steps"),
     ]

@@ -1,6 +1,7 @@
 """How alike two views of a stylised scene are where both show the same points (short- and long-range consistency)."""
 
-from typing import Dict, Optional, Sequence
+import statistics
+from typing import Dict, List, Optional, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -13,6 +14,8 @@ from sparsestyle_ns.utils.progress import track
 
 RANGES = {"short": 1, "long": 7}
 """Frames between the two views of a pair, as in Stylos and Styl3R."""
+PERCEPTUAL_EVERY = 3
+"""Perceptual distances are of every third pair: they take most of the time, and neighbours say the same."""
 SSIM_SIGMA, SSIM_RADIUS, SSIM_CONSTANTS = 1.5, 5, (0.01**2, 0.03**2)
 """The Gaussian window of SSIM, 11 × 11, and what keeps its quotients finite (Wang et al. 2004)."""
 
@@ -29,12 +32,17 @@ def masked_ssim(first: Picture, second: Picture, visible: Mask) -> Float[Tensor,
     """Mean SSIM (Wang et al. 2004) of pictures in [0, 1], by visible pixels alone; NaN where none is visible."""
     offsets = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, device=first.device, dtype=first.dtype)
     profile = torch.exp(-0.5 * (offsets / SSIM_SIGMA).square())
-    window = torch.outer(profile, profile)[None, None] / profile.sum().square()
+    row = (profile / profile.sum())[None, None, None]
     mask = visible.to(first.dtype)[None, None]
-    share = F.conv2d(mask, window, padding=SSIM_RADIUS).clamp_min(torch.finfo(first.dtype).tiny)
+
+    def weighed(values: Float[Tensor, "C 1 H W"]) -> Float[Tensor, "C 1 H W"]:
+        # The window is a product, and twice eleven pixels are quicker than eleven times eleven.
+        return F.conv2d(F.conv2d(values, row, padding=(0, SSIM_RADIUS)), row.mT, padding=(SSIM_RADIUS, 0))
+
+    share = weighed(mask).clamp_min(torch.finfo(first.dtype).tiny)
 
     def mean(values: Float[Tensor, "C 1 H W"]) -> Float[Tensor, "C 1 H W"]:
-        return F.conv2d(values * mask, window, padding=SSIM_RADIUS) / share
+        return weighed(values * mask) / share
 
     x, y = (picture.permute(2, 0, 1)[:, None] for picture in (first, second))
     mean_x, mean_y = mean(x), mean(y)
@@ -55,13 +63,19 @@ def masked_distance(metric: Metric, first: Picture, second: Picture, visible: Ma
 
 
 @torch.no_grad()
-def pair_consistency(first: Picture, second: Picture, correspondence: Correspondence) -> Dict[str, float]:
-    """`rmse`, `ssim` and `perceptual_metrics` of a view and another warped to it; nothing where they share no pixel."""
+def pair_consistency(
+    first: Picture, second: Picture, correspondence: Correspondence, perceptual: bool = True
+) -> Dict[str, float]:
+    """`rmse`, `ssim` and, unless told not to, `perceptual_metrics` of a view and another warped to it.
+
+    Nothing where they share no pixel.
+    """
     visible = correspondence.visible
     if not visible.any():
         return {}
     first, second = first.clamp(0.0, 1.0), second.clamp(0.0, 1.0)
-    warped, metrics = sample_picture(second, correspondence.pixels), perceptual_metrics(first.shape[:2])
+    warped = sample_picture(second, correspondence.pixels)
+    metrics = perceptual_metrics(first.shape[:2]) if perceptual else {}
     return {
         "rmse": float(masked_rmse(first, warped, visible)),
         "ssim": float(masked_ssim(first, warped, visible)),
@@ -84,12 +98,18 @@ class PathGeometry:
         return sum(shares) / len(shares) if shares else None
 
     def consistency(self, frames: Sequence[Float[Tensor, "H W 3"]]) -> Dict[str, float]:
-        """`short_rmse`, `short_ssim` …, `long_rmse` …: means over all pairs of the range that share a pixel."""
+        """`short_rmse`, `short_ssim` …, `long_rmse` …: means over the pairs of the range that share a pixel.
+
+        Of the perceptual distances over every third pair of these.
+        """
         means = {}
         for name, gap in RANGES.items():
-            pairs = track(self.pairs[name], f"Consistency, {name} range")
-            values = [pair_consistency(frames[t], frames[t + gap], pair) for t, pair in enumerate(pairs)]
-            kept = [value for value in values if value]
-            for key in kept[0] if kept else ():
-                means[f"{name}_{key}"] = sum(value[key] for value in kept) / len(kept)
+            values: Dict[str, List[float]] = {}
+            shared = [t for t, pair in enumerate(self.pairs[name]) if pair.visible.any()]
+            for place, t in enumerate(track(shared, f"Consistency, {name} range")):
+                perceptual = place % PERCEPTUAL_EVERY == 0
+                found = pair_consistency(frames[t], frames[t + gap], self.pairs[name][t], perceptual)
+                for key, value in found.items():
+                    values.setdefault(key, []).append(value)
+            means.update({f"{name}_{key}": statistics.fmean(each) for key, each in values.items()})
         return means

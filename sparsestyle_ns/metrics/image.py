@@ -106,15 +106,22 @@ def perceptual_metrics(size: Tuple[int, ...]) -> Dict[str, Metric]:
     return {name: metric for name, metric in metrics.items() if metric is not None}
 
 
-def image_metrics(image: Float[Tensor, "H W 3"], photo: Float[Tensor, "H W 3"]) -> Dict[str, float]:
-    """`psnr` in dB, `ssim`, and `lpips` and `st_lpips` where there are weights for them, of images in [0, 1]."""
+def structural_similarity(image: Float[Tensor, "H W 3"], photo: Float[Tensor, "H W 3"]) -> float:
+    """SSIM of images in [0, 1]; the first is clipped to that."""
     from torchmetrics.functional import structural_similarity_index_measure
 
+    pictures = image.detach().clamp(0.0, 1.0).cpu(), photo.cpu()
+    batch, reference = (picture.permute(2, 0, 1)[None] for picture in pictures)
+    return float(structural_similarity_index_measure(batch, reference, data_range=1.0))
+
+
+def image_metrics(image: Float[Tensor, "H W 3"], photo: Float[Tensor, "H W 3"]) -> Dict[str, float]:
+    """`psnr` in dB, `ssim`, and `lpips` and `st_lpips` where there are weights for them, of images in [0, 1]."""
     image, photo = image.detach().clamp(0.0, 1.0).cpu(), photo.cpu()
     batch, reference = (picture.permute(2, 0, 1)[None] for picture in (image, photo))
     return {
         "psnr": psnr(image, photo),
-        "ssim": float(structural_similarity_index_measure(batch, reference, data_range=1.0)),
+        "ssim": structural_similarity(image, photo),
         **{name: float(metric(batch, reference)) for name, metric in perceptual_metrics(photo.shape[:2]).items()},
     }
 

@@ -12,7 +12,7 @@ from torch.nn import Parameter
 from sparsestyle_ns.core.occupancy import DensityVolume, Occupancy
 from sparsestyle_ns.core.precision import autocast
 from sparsestyle_ns.fields.fine import FineFieldConfig, FineTunedField, StylisedField
-from sparsestyle_ns.metrics.image import image_metrics
+from sparsestyle_ns.metrics.image import image_metrics, structural_similarity
 from sparsestyle_ns.models.scene_model import SceneModel, SceneModelConfig
 from sparsestyle_ns.rendering import render
 from sparsestyle_ns.rendering.baked import BakedCache, BakedVolume, shade_of
@@ -37,7 +37,7 @@ class HierStyleModelConfig(FineFieldConfig, SceneModelConfig):
     _target: Type = field(default_factory=lambda: HierStyleModel)
     num_steps: int = 128
     """Even steps along a ray, on which the frozen coarse field is looked at; those in empty cells are skipped."""
-    num_samples: Optional[int] = 6
+    num_samples: Optional[int] = 4
     """Samples a ray on which the stylised field is looked at, where the coarse field's weight is; None: every step
     that can show, as with a fine-tuned copy of the coarse field, whose weight moves."""
     even_share: float = 0.25
@@ -207,5 +207,5 @@ class HierStyleModel(SceneModel):
         """How well the coarse render shows the photo, and how much of its structure the stylised one keeps (SSIM)."""
         photo = batch["image"][..., :3].to(outputs["rgb"])
         metrics = {f"coarse_{name}": value for name, value in image_metrics(outputs["rgb_coarse"], photo).items()}
-        metrics["content_ssim"] = image_metrics(outputs["rgb"], photo)["ssim"]
+        metrics["content_ssim"] = structural_similarity(outputs["rgb"], photo)
         return metrics, {"img": torch.cat([photo, outputs["rgb_coarse"], outputs["rgb"]], dim=1)}

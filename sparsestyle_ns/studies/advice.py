@@ -58,8 +58,16 @@ def setting_line(curve: Curve) -> str:
         words = f"{chosen.setting} instead of {preset.setting}: {_compared(curve, chosen, preset)}"
     else:
         words = f"keep {preset.setting}; {chosen.setting} would be no better: {_compared(curve, chosen, preset)}"
-    order = "" if curve.order is None else f" Observed order of convergence: {curve.order:.1f}."
-    return f"{curve.title} ({curve.flag}): {words}{_remarks(chosen, *([preset] if preset else []))}{order}"
+    remarks = _remarks(chosen, *([preset] if preset else []))
+    return f"{curve.title} ({curve.flag}): {words}{remarks}{_convergence(curve)}"
+
+
+def _convergence(curve: Curve) -> str:
+    """Of a curve over numbers of samples: the errors, and how fast they fall."""
+    if curve.order is None:
+        return ""
+    errors = ", ".join(f"{curve.error_of(point):.2g} with {point.setting}" for point in curve.points)
+    return f" Errors: {errors}. Observed order of convergence: {curve.order:.1f}."
 
 
 def is_worth_a_change(curve: Curve, chosen: Point, preset: Point) -> bool:

@@ -2,9 +2,10 @@
 
 import contextlib
 import copy
+import dataclasses
 import functools
 import math
-from typing import Callable, ContextManager, Dict, Iterator, List, Mapping, Optional, Sequence, Tuple
+from typing import Callable, ContextManager, Dict, Iterator, List, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 import torch
 from jaxtyping import Float
@@ -13,16 +14,19 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from sparsestyle_ns.core.occupancy import Occupancy
-from sparsestyle_ns.core.precision import Precision, autocast, multiplies_bfloat16, multiplies_tf32
+from sparsestyle_ns.core.occupancy import Occupancy, PackedSamples
+from sparsestyle_ns.core.precision import Precision, multiplies_bfloat16, multiplies_tf32
+from sparsestyle_ns.core.sampling import even_edges
+from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
-from sparsestyle_ns.models.hier_style import HierStyleModel
+from sparsestyle_ns.models.hier_style import RAYS_PER_CALL, HierStyleModel
 from sparsestyle_ns.rendering.baked import BakedVolume, render_baked
-from sparsestyle_ns.rendering.render import POINTS_PER_CALL, render_coarse
+from sparsestyle_ns.rendering.few_samples import Stretches, cut_into_stretches
+from sparsestyle_ns.rendering.render import POINTS_PER_CALL, render_packed
 from sparsestyle_ns.studies.curves import Curve, Values, decibels, observed_order
 from sparsestyle_ns.studies.study import with_setting
 from sparsestyle_ns.studies.time_budget import Budget, Case, Plan, in_turns
-from sparsestyle_ns.studies.workbench import Model, Workbench, setting_curve
+from sparsestyle_ns.studies.workbench import Workbench, setting_curve
 
 Colors = Float[Tensor, "rays 3"]
 Change = Callable[[], ContextManager[None]]
@@ -33,6 +37,8 @@ CONVERGED = 16
 REFERENCE_SHARE = 0.4
 """Part of the time that the converged render may take; the number of rays follows from it."""
 MIN_RAYS, MAX_RAYS = 64, 4096
+SAMPLES_PER_RAY = POINTS_PER_CALL // RAYS_PER_CALL
+"""By which rays are cut into batches as pictures are; with fewer at once, work of a batch would count too much."""
 FACTORS = (1 / 8, 1 / 4, 1 / 2, 1, 2)
 """Numbers of samples, as multiples of the preset's."""
 MIN_ALPHAS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3)
@@ -90,121 +96,181 @@ def multiples(preset: int) -> List[int]:
 
 
 def quadrature_plans(bench: Workbench) -> List[Plan]:
-    """Samples a ray of the coarse field; and steps, skipping and stopping of stage 2's renders, measured together.
+    """How exact sums along rays are: samples of the coarse field; steps, skipping and stopping; samples of stage 2.
 
-    The last three are looked at in the coarse picture that comes with each stylised one: what the residual field says
-    of empty cells, which training never visits, means nothing, and a render that skips nothing would show it.
+    Steps, skipping and stopping are looked at in the coarse picture that comes with each stylised one: what the
+    residual field says of empty cells, which training never visits, means nothing, and a render that skips nothing
+    would show it.
     """
 
-    samples, *marching = (
-        setting_curve(config, f"pipeline.model.{setting}", "quadrature", name, title, [("view_seconds", "rmse")])
-        for config, setting, name, title in (
-            (bench.coarse_config, "num_eval_samples", "samples", "Samples a ray of the coarse field"),
-            (bench.style_config, "num_steps", "steps", "Steps along a ray of the stylised field"),
-            (bench.style_config, "min_alpha", "skipping", "Opacity below which cells are skipped"),
-            (bench.style_config, "min_transmittance", "stopping", "Light left at which a ray ends"),
+    def curve(config: SparseStyleTrainerConfig, setting: str, name: str, title: str) -> Curve:
+        return setting_curve(config, f"pipeline.model.{setting}", "quadrature", name, title, [("view_seconds", "rmse")])
+
+    samples = curve(bench.coarse_config, "num_eval_samples", "samples", "Samples a ray of the coarse field")
+    marching = [
+        curve(bench.style_config, setting, name, title)
+        for setting, name, title in (
+            ("num_steps", "steps", "Steps along a ray, by which samples are placed"),
+            ("min_alpha", "skipping", "Opacity below which cells are skipped"),
+            ("min_transmittance", "stopping", "Light left at which a ray ends"),
         )
-    )
+    ]
+    title = "Samples a ray of the stylised field"
+    stylised = {
+        on: curve(bench.style_config, "num_samples", f"stylised samples, {words}", f"{title}, {words}")
+        for on, words in ((False, "no residual density"), (True, "residual density"))
+    }
     return [
         Plan([samples], 3, lambda budget: _measure_samples(bench, samples, budget)),
         Plan(marching, 9, lambda budget: _measure_marching(bench, *marching, budget)),
+        Plan(list(stylised.values()), 4, lambda budget: _measure_stylised_samples(bench, stylised, budget)),
     ]
 
 
 def _measure_samples(bench: Workbench, curve: Curve, budget: Budget) -> None:
     model = bench.coarse_to_render()
+    converged = CONVERGED * model.config.num_steps
     changes = _settings(model.config, "num_eval_samples", multiples(model.config.num_eval_samples))
-    _sweep(bench, model, "num_eval_samples", {curve: changes}, contextlib.nullcontext, budget)
+
+    def exact(rays: RayBundle) -> Colors:
+        segments = model.space.segments(rays.origins, rays.directions)
+        return model.render(segments, rays.directions, even_edges(len(rays), converged, model.device)).rgb
+
+    reference = Reference(f"{converged} even samples a ray", converged, exact)
+    _sweep(bench, lambda rays: model.get_outputs(rays)["rgb"], {curve: changes}, reference, budget)
+    _find_order(curve)
 
 
 def _measure_marching(bench: Workbench, steps: Curve, skipping: Curve, stopping: Curve, budget: Budget) -> None:
     model = bench.model_to_render()
     config = model.config
-    grids = occupancies(model, sorted({*MIN_ALPHAS, config.min_alpha}), budget)
-    transmittances = sorted({*MIN_TRANSMITTANCES, config.min_transmittance})
-    changes = {
-        steps: _settings(config, "num_steps", multiples(config.num_steps)),
-        skipping: {alpha: functools.partial(altered, model, occupancy=grid) for alpha, grid in grids.items()},
-        stopping: _settings(config, "min_transmittance", transmittances),
-    }
+    converged = CONVERGED * max(multiples(config.num_steps))
 
     @contextlib.contextmanager
-    def nothing_skipped() -> Iterator[None]:
-        everywhere = Occupancy(1).to(model.device)
-        with altered(model, occupancy=everywhere), altered(config, min_transmittance=0.0):
+    def at_every_step(change: Change) -> Iterator[None]:
+        with altered(config, num_samples=None), change():
             yield
 
-    _sweep(bench, model, "num_steps", changes, nothing_skipped, budget)
+    def exact(rays: RayBundle) -> Colors:
+        everywhere = Occupancy(1).to(model.device)
+        finest = altered(config, num_samples=None, num_steps=converged, min_transmittance=0.0)
+        with finest, altered(model, occupancy=everywhere):
+            return model.get_outputs(rays)["rgb_coarse"]
+
+    transmittances = sorted({*MIN_TRANSMITTANCES, config.min_transmittance})
+    skips = {alpha: functools.partial(altered, model, occupancy=grid) for alpha, grid in occupancies(model).items()}
+    stops = _settings(config, "min_transmittance", transmittances)
+    changes = {
+        steps: _settings(config, "num_steps", multiples(config.num_steps)),
+        skipping: {alpha: functools.partial(at_every_step, change) for alpha, change in skips.items()},
+        stopping: {light: functools.partial(at_every_step, change) for light, change in stops.items()},
+    }
+    reference = Reference(f"{converged} steps a ray with nothing skipped and no early stop", converged, exact)
+    _sweep(bench, lambda rays: model.get_outputs(rays)["rgb_coarse"], changes, reference, budget)
+    for curve in (skipping, stopping):
+        curve.note += " With a sample at every step, as baked rendering and a fine-tuned coarse field have them."
+    _find_order(steps)
+
+
+def _measure_stylised_samples(bench: Workbench, curves: Mapping[bool, Curve], budget: Budget) -> None:
+    """Both curves, without residual density and with it, where the field has any; with a render of their own each."""
+    model = bench.model_to_render()
+    config, output = model.config, "rgb" if bench.is_stylised else "rgb_coarse"
+    preset = config.num_samples or config.num_steps
+    converged = CONVERGED * max(multiples(preset))
+    finest = {"num_samples": converged, "num_steps": CONVERGED * config.num_steps}
+
+    def draw(rays: RayBundle) -> Colors:
+        return model.get_outputs(rays)[output]
+
+    def exact(rays: RayBundle) -> Colors:
+        with altered(config, **finest):
+            return draw(rays)
+
+    reference = Reference(f"{converged} samples a ray, placed by {finest['num_steps']} steps", converged, exact)
+    decision, look = model.effects["residual_density"], model.display.own
+    ways = [False, True] if decision.on else [False]
+    for on in (on for on in curves if on not in ways):
+        curves[on].left_out.append("all: there is no residual density here")
+    for number, on in enumerate(ways):
+        effects = model.effects.replaced(dataclasses.replace(decision, on=on))
+        flat = dataclasses.replace(look, mix=look.mix._replace(geometry=look.mix.geometry if on else 0.0))
+        changes = _settings(config, "num_samples", multiples(preset))
+        with altered(model, effects=effects), altered(model.display, own=flat):
+            part = budget.part(budget.left / (len(ways) - number))
+            _sweep(bench, draw, {curves[on]: changes}, reference, part)
+        _find_order(curves[on])
 
 
 def _settings(config: object, name: str, values: Sequence[float]) -> Dict[float, Change]:
     return {value: functools.partial(altered, config, **{name: value}) for value in values}
 
 
+def _find_order(curve: Curve) -> None:
+    """Notes the observed order of a curve over numbers of samples."""
+    errors = [point.median("rmse") for point in curve.points]
+    curve.order = observed_order([int(point.setting) for point in curve.points], errors)
+
+
+class Reference(NamedTuple):
+    """A converged render."""
+
+    words: str
+    """What it has."""
+    samples: int
+    """A ray."""
+    render: Callable[[RayBundle], Colors]
+
+
 def _sweep(
     bench: Workbench,
-    model: Model,
-    samples: str,
+    draw: Callable[[RayBundle], Colors],
     changes: Mapping[Curve, Mapping[float, Change]],
-    nothing_skipped: Change,
+    reference: Reference,
     budget: Budget,
 ) -> None:
-    """Renders some rays of held-out views in different ways, and compares with a converged render, `nothing_skipped`.
+    """Renders some rays of held-out views in different ways, and compares with a converged render.
 
-    The first curve's setting is `samples`; `changes` has of each curve the values, and what gives the model this value.
+    `changes` has of each curve the values, and what makes `draw` render with this value.
     """
-    output = "rgb" if model is bench.coarse_model else "rgb_coarse"
-    preset = getattr(model.config, samples)
-    converged = CONVERGED * max(multiples(preset))
 
     def render(bundle: RayBundle) -> Colors:
-        count = getattr(model.config, samples)
-        return render_in_chunks(bundle, count, budget, lambda part: model.get_outputs(part)[output])
+        return render_in_chunks(bundle, SAMPLES_PER_RAY, budget, draw)
+
+    def converged(bundle: RayBundle) -> Colors:
+        return render_in_chunks(bundle, reference.samples, budget, reference.render)
 
     probe = bench.some_rays(MIN_RAYS)
     render(probe)
-    seconds_a_ray = bench.timed(lambda: render(probe))[0] / len(probe) * converged / preset
+    seconds_a_ray = bench.timed(lambda: converged(probe))[0] / len(probe)
     fitting = int(REFERENCE_SHARE * budget.left / max(seconds_a_ray, 1e-12))
     rays = bench.some_rays(min(MAX_RAYS, max(MIN_RAYS, fitting)))
-    with nothing_skipped(), altered(model.config, **{samples: converged}):
-        reference = render(rays)
+    picture = converged(rays)
     height, width = bench.size
     for curve in changes:
         curve.own_error = bench.own_error
         curve.note = (
-            f"{len(rays)} random rays of held-out views, against {converged} samples a ray with nothing skipped and no "
-            f"early stop; seconds are scaled to a view of {width} × {height}."
+            f"{len(rays)} random rays of held-out views, against {reference.words}; seconds are scaled to a view of "
+            f"{width} × {height}."
         )
 
     def case(curve: Curve, value: float, change: Change) -> Case:
         def measure(_round: int) -> Mapping[str, Values]:
             with change():
-                return {"": timed_and_compared(bench, render, rays, reference)}
+                return {"": timed_and_compared(bench, render, rays, picture)}
 
         return Case([(curve, value)], measure)
 
     cases = [case(curve, *change) for curve, ways in changes.items() for change in ways.items()]
     in_turns(cases, budget, bench.rounds, bench.watch)
-    first, *_ = changes
-    errors = [point.median("rmse") for point in first.points]
-    first.order = observed_order([int(point.setting) for point in first.points], errors)
 
 
-@torch.no_grad()
-def occupancies(model: HierStyleModel, thresholds: Sequence[float], budget: Budget) -> Dict[float, Occupancy]:
-    """The occupied cells for several thresholds; the field is evaluated once for all of them, if there is time."""
-    densities: List[Tensor] = []
-
-    def evaluate(points: Tensor) -> Tensor:
-        budget.check()
-        with autocast(model.device, model.config.precision):
-            densities.append(model.field.density_and_feature(points)[0])
-        return densities[-1]
-
-    grids = {threshold: Occupancy(model.config.occupancy_resolution).to(model.device) for threshold in thresholds}
-    for threshold, grid in grids.items():
-        known = iter(densities) if densities else None
-        grid.measure(evaluate if known is None else lambda _, known=known: next(known), threshold, POINTS_PER_CALL)
+def occupancies(model: HierStyleModel) -> Dict[float, Occupancy]:
+    """The occupied cells for several thresholds, by the densities that the model has measured."""
+    grids = {}
+    for threshold in sorted({*MIN_ALPHAS, model.config.min_alpha}):
+        grids[threshold] = Occupancy(model.config.occupancy_resolution).to(model.device)
+        grids[threshold].measure(model.volume, threshold)
     return grids
 
 
@@ -238,7 +304,7 @@ def _measure_baking(bench: Workbench, curve: Curve, budget: Budget) -> None:
 
         at = frame % len(flight)
         rays = flight[at : at + 1].generate_rays(camera_indices=0, keep_shape=False).flatten()
-        return bench.timed(lambda: render_in_chunks(rays, model.config.num_steps, budget, render))
+        return bench.timed(lambda: render_in_chunks(rays, SAMPLES_PER_RAY, budget, render))
 
     def measure_exact(round_: int) -> Mapping[str, Values]:
         if not exact:
@@ -286,15 +352,15 @@ def _measure_precision(bench: Workbench, curve: Curve, budget: Budget) -> None:
     has |= {"tf32": multiplies_tf32(device), "bfloat16": multiplies_bfloat16(device)}
     curve.left_out += [f"{name}: the device has no instructions for it" for name, there in has.items() if not there]
     curve.own_error = bench.own_error
-    rays, samples = bench.some_rays(FORMAT_RAYS), model.config.num_eval_samples
+    rays = bench.some_rays(FORMAT_RAYS)
     curve.note = (
         f"{len(rays)} random rays of held-out views of the coarse field, against the same samples in float64; and "
         "iterations of stage 1."
     )
-    reference = render_in_chunks(rays, samples, budget, lambda part: in_float64(model, part))
+    reference = render_in_chunks(rays, SAMPLES_PER_RAY, budget, lambda part: in_float64(model, part))
 
     def render(bundle: RayBundle) -> Colors:
-        return render_in_chunks(bundle, samples, budget, lambda part: model.get_outputs(part)["rgb"])
+        return render_in_chunks(bundle, SAMPLES_PER_RAY, budget, lambda part: model.get_outputs(part)["rgb"])
 
     def case(precision: Precision) -> Case:
         training = bench.start(with_setting(bench.coarse_config, PRECISION, precision), budget)
@@ -313,10 +379,15 @@ def _measure_precision(bench: Workbench, curve: Curve, budget: Budget) -> None:
 
 def in_float64(model: CoarseFewShotModel, bundle: RayBundle) -> Colors:
     """Colours of rays with the same samples, computed in float64."""
+    marching, directions = model.marching(), bundle.directions.double()
     in_float32 = model.space.segments(bundle.origins, bundle.directions)
-    edges = model.place_samples(in_float32, model.config.num_eval_samples, None).double()
-    background = None if model.background is None else model.background.double()
-    directions = bundle.directions.double()
+    stretches = cut_into_stretches(in_float32, marching.few, marching.num_steps, marching.unbounded)
     segments = model.space.segments(bundle.origins.double(), directions)
+    on_ray, s, lengths, _ = stretches.samples
+    s, lengths = s.double(), lengths.double()
+    samples = PackedSamples(on_ray, s, lengths, segments.positions(s, on_ray))
     field = copy.deepcopy(model.field).double()
-    return render_coarse(field, segments, directions, edges, model.space.unbounded, background).rgb
+    density, feature = field.density_and_feature(samples.positions)
+    mean = Stretches(samples, stretches.depth.double()).density(marching.few.volume, density)
+    background = None if model.background is None else model.background.double()
+    return render_packed(samples, len(bundle), mean, field.color(feature, directions[on_ray]), background).rgb

@@ -6,6 +6,7 @@ import statistics
 from typing import Callable, Dict, List, NamedTuple, Sequence, Tuple
 
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
+from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.studies.curves import Curve, Values
 from sparsestyle_ns.studies.study import get_setting, with_setting
 from sparsestyle_ns.studies.study_options import Group
@@ -107,7 +108,7 @@ class StageRuns:
                 bench.start(config, budget)  # freezes the views, once for all runs
                 budget.check()
         setup, probe = bench.timed(lambda: bench.start(config, budget))
-        steps, model = bench.train(probe, 1 + PROBE_STEPS, budget), probe.pipeline.model
+        seconds_a_step, model = self._seconds_a_step(probe, budget), probe.pipeline.model
         budget.check()
         if type(model) not in bench.view_seconds:
             bench.evaluate(model, bench.views[:1])
@@ -116,9 +117,22 @@ class StageRuns:
         shares = shares[-max(1, int(EVALUATION_SHARE * budget.left / seconds)) :]
         views = bench.views[: max(1, int(EVALUATION_SHARE * budget.left / (len(shares) * seconds)))]
         left = budget.left - setup - len(shares) * len(views) * seconds
-        fitting = int((WARM_START_SHARE if self.is_style else 1.0) * left / statistics.mean(steps[1:]))
+        fitting = int((WARM_START_SHARE if self.is_style else 1.0) * left / seconds_a_step)
         iterations = min(config.max_num_iterations, max(MIN_ITERATIONS, fitting))
         return RunPlan(iterations, sorted({math.ceil(iterations * share) for share in shares}), views)
+
+    def _seconds_a_step(self, probe: Training, budget: Budget) -> float:
+        """Mean over a run's iterations, by a few of them; in stage 2 by a few at each size of the views."""
+        starts = {0: 1.0}
+        if self.is_style:
+            schedules = [level.schedule for level in probe.pipeline.task.levels]
+            starts = {schedule.first: float(schedule.length) for schedule in schedules}
+        total = 0.0
+        for first, length in starts.items():
+            probe.num_steps = first
+            steps = self.bench.train(probe, first + 1 + PROBE_STEPS, budget)
+            total += length * statistics.mean(steps[1:] or steps)
+        return total / sum(starts.values())
 
     def _long(self, curve: Curve, budget: Budget) -> None:
         bench, config = self.bench, self._config()

@@ -21,13 +21,15 @@ COARSE_KINDS: Dict[str, Settings] = {
 same with a semantic loss of DietNeRF's kind; and ten octaves with FreeNeRF's regularisers."""
 COLORS_ALONE: Settings = {"pipeline.effects.view_color": "on", "pipeline.effects.matched_depth": "off"}
 """What both stages have to be told of every kind of stage 1 but ours."""
+CONSTANT: Settings = {"pipeline.content_decay": 1.0, "pipeline.content_restart": 1.0}
+"""The content weight stays as it is in all iterations, at each size of the views."""
 FINE_TUNING: Settings = {
     "pipeline.model.stylised_field": "coarse",
     "optimizers.fields.optimizer.lr": 5e-4,
     "pipeline.loss_weights.content": 0.1,
-    "pipeline.content_decay": 1.0,
-    # A sample's activations take twice the memory that the residual field's do, and are all kept.
-    "pipeline.samples_per_chunk": 131072,
+    **CONSTANT,
+    # Every step counts as a sample, and of those that show all activations are kept: about 10 KB each.
+    "pipeline.samples_per_chunk": 1 << 19,
 }
 STYLE_KINDS: Dict[str, Settings] = {
     "ours": {},
@@ -35,10 +37,7 @@ STYLE_KINDS: Dict[str, Settings] = {
     "ec-only": {"pipeline.model.fine_encoding": "none"},
     "frequency": {"pipeline.model.fine_encoding": "frequency"},
     "coarse-density": {"pipeline.effects.residual_density": "off"},
-    **{
-        f"lambda-{weight:g}": {"pipeline.loss_weights.content": weight, "pipeline.content_decay": 1.0}
-        for weight in (10.0, 1.0, 0.1)
-    },
+    **{f"lambda-{weight:g}": {"pipeline.loss_weights.content": weight, **CONSTANT} for weight in (10.0, 1.0, 0.1)},
 }
 """Stage 2: as it is; the coarse field itself fine-tuned, as ARF does, at stage 1's learning rate and with the content
 weight that ours ends with; and the paper's ablations."""

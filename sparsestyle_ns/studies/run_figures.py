@@ -18,7 +18,7 @@ from sparsestyle_ns.engine.loading import evaluate_run, load_run
 from sparsestyle_ns.evaluation.held_out import PathFrames, render_path, saved_report, stylisation_figures
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID, missing_weights
-from sparsestyle_ns.metrics.image import gram_matrix, has_lpips, image_metrics
+from sparsestyle_ns.metrics.image import gram_matrix, has_lpips, structural_similarity
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import REPORT_FILE
@@ -57,14 +57,14 @@ class PaintingMeasure:
     def figures(self, frames: PathFrames, settings: HierStylePipelineConfig) -> Dict[str, float]:
         """Means over some frames of style strength and content kept, and their ArtFID; by a run's network and sizes."""
         if self._targets is None:
-            settings = replace(settings, style_image=self.painting)
-            self._targets = settings.targets_of(*settings.load_style(), torch.device("cpu"))
+            settings, side = replace(settings, style_image=self.painting), max(frames.stylised[0].shape[:2])
+            self._targets = settings.targets_of(*settings.load_style(), torch.device("cpu"), side)
         values, art_fid, gram = [], ArtFID.against(self._targets.style_image), gram_matrix(self._targets.style_rows())
         for index in track(range(0, len(frames.stylised), STYLE_EVERY), "Style and content"):
             stylised, coarse = frames.stylised[index], frames.coarse[index]
             covered = frames.surfaces[index].covered.float()
             figures = stylisation_figures(self._targets, gram, coarse, stylised, covered)
-            values.append({**figures, "unstylised_ssim": image_metrics(stylised, coarse)["ssim"]})
+            values.append({**figures, "unstylised_ssim": structural_similarity(stylised, coarse)})
             if art_fid is not None:
                 art_fid.add(stylised, coarse)
         means = {key: sum(value[key] for value in values) / len(values) for key in values[0]}

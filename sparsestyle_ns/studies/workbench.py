@@ -13,7 +13,7 @@ from torch import Tensor
 from sparsestyle_ns.data.view_selection import evenly_spaced
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
-from sparsestyle_ns.engine.training import Training
+from sparsestyle_ns.engine.training import Training, WarmUpSchedulerConfig
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.image import image_metrics
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
@@ -51,8 +51,9 @@ def squeezed(config: SparseStyleTrainerConfig, iterations: int) -> SparseStyleTr
             scheduler.max_steps = scaled(scheduler.max_steps)
         elif isinstance(scheduler, MultiStepSchedulerConfig):
             scheduler.milestones = tuple(map(scaled, scheduler.milestones))
+        if isinstance(scheduler, WarmUpSchedulerConfig):
+            scheduler.warm_up = scaled(scheduler.warm_up)
     if isinstance(pipeline, HierStylePipelineConfig):
-        pipeline.content_steps = scaled(pipeline.content_steps)
         pipeline.warm_start_steps = scaled(pipeline.warm_start_steps) if pipeline.warm_start_steps else 0
     return config
 
@@ -92,12 +93,16 @@ class Workbench:
         )
         self.effects = decide(self.manager.scene, self.coarse_config.pipeline.effects)
         self.manager.set_effects(self.effects)
+        settings: HierStylePipelineConfig = self.style_config.pipeline
+        settings.feature_side = settings.feature_side or self.manager.photo_side  # a number, to measure others beside
         self.eval_dataset = self.manager.eval_dataset
         self.views = list(evenly_spaced(len(self.eval_dataset), min(HELD_OUT_VIEWS, len(self.eval_dataset))))
         self.photos = {view: self.eval_dataset[view]["image"][..., :3].to(self.device) for view in self.views}
         self.scene_views: Optional[SceneViews] = None
-        self._targets: Dict[Tuple[int, Optional[int], Optional[int]], StyleTargets] = {}
-        self.targets = None if style_image is None else self.targets_for(self.style_config.pipeline)
+        self.style = None if style_image is None else settings.load_style()
+        self.targets: Optional[StyleTargets] = None
+        if self.style is not None:
+            self.targets = settings.targets_of(*self.style, self.device, self.manager.photo_side)
         self.coarse_model: Optional[CoarseFewShotModel] = None
         self.coarse_state: Optional[Dict[str, Tensor]] = None
         self.own_error: Optional[float] = None
@@ -132,13 +137,6 @@ class Workbench:
         rays.camera_indices = torch.zeros_like(rays.camera_indices)
         return rays
 
-    def targets_for(self, config: HierStylePipelineConfig) -> StyleTargets:
-        """The painting's features with a run's settings, worked out once."""
-        key = config.feature_side, config.style_side, config.style_features
-        if key not in self._targets:
-            self._targets[key] = config.targets_of(*config.load_style(), self.device)
-        return self._targets[key]
-
     def _setup_pipeline(self, config: SparseStyleTrainerConfig) -> CheckedPipeline:
         config.pipeline.decided = self.effects
         return config.pipeline.setup(device=str(self.device), test_mode="test", world_size=1, local_rank=0)
@@ -156,7 +154,7 @@ class Workbench:
 
         def share(pipeline: HierStylePipeline) -> None:
             budget.check()
-            pipeline.targets = self.targets_for(config.pipeline)
+            pipeline.style = self.style
             if self.scene_views is None:
                 self.scene_views = pipeline.freeze_views()
             for view in self.scene_views.views:
@@ -219,6 +217,7 @@ class Workbench:
         """The coarse model that was kept, or an `OutOfTimeError` where there was no time to train one."""
         if self.coarse_model is None:
             raise OutOfTimeError
+        self.coarse_model.finish_learning()
         return self.coarse_model.eval()
 
     def model_to_render(self) -> HierStyleModel:
@@ -226,9 +225,10 @@ class Workbench:
         if self.style_model is None:
             config = self.adapted_style_config()
             cells, coarse = config.pipeline.model.occupancy_resolution**3, self.coarse_config.pipeline.model
-            # Finding the empty cells can't be stopped on the way.
+            # Measuring its densities can't be stopped on the way.
             view_seconds = self.view_seconds.get(CoarseFewShotModel, 0.0)
-            self.budget.check(cells * view_seconds / (math.prod(self.size) * coarse.num_eval_samples))
+            samples = coarse.num_samples if self.trains_coarse else coarse.num_eval_samples
+            self.budget.check(cells * view_seconds / (math.prod(self.size) * samples))
             model = self._setup_pipeline(config).model
             model.adopt_coarse(self.coarse_state)
             self.style_model = model

@@ -60,6 +60,8 @@ def test_collect_run_shows_photos_and_held_out_views_wherever_the_run_is_now(run
             assert pixels.shape == (24, 32, 3)
             assert pixels.dtype == np.uint8
     assert dict(run.settings)["Iterations"] == "3 of 3"
+    assert dict(run.settings)["Size it sees views at"] == "24 pixels in 2 iterations, then 48 pixels in 1 iterations"
+    assert dict(run.settings)["Content weight λ"] == "10 to 0.1 in 1 iterations, then 3 to 0.1 in 1 iterations"
     assert run.subtitle == "hier-style, 3 photos, 3 iterations"
     assert run.style_name == "painting"
     assert [table.title for table in run.tables] == ["Mean of the views above, 2"]
@@ -73,8 +75,8 @@ def test_a_run_on_reduced_photos_is_shown_with_the_photos_as_they_are(runs, tmp_
     moved = tmp_path / "outputs" / "scene" / "hier-style" / "run"
     shutil.copytree(runs.style, moved)
     config = (moved / "config.yml").read_text()
-    assert "max_image_side: 1008" in config
-    (moved / "config.yml").write_text(config.replace("max_image_side: 1008", "max_image_side: 16"))
+    assert "max_image_side: 504" in config
+    (moved / "config.yml").write_text(config.replace("max_image_side: 504", "max_image_side: 16"))
     run = collect_run(moved, num_views=1, frames=0)
     assert dict(run.settings)["Photo size in training"] == "16 × 12 pixels"
     pictures = [photo.pixels for photo in run.photos]

@@ -30,6 +30,8 @@ COARSE_FLAGS = (
     *("--pipeline.model.coarse-field.layer-width", "16"),
     *("--pipeline.model.coarse-field.feature-dim", "4"),
     *("--pipeline.model.num-eval-samples", "8"),
+    *("--pipeline.model.num-steps", "16"),
+    *("--pipeline.model.volume-resolution", "8"),
     *("--pipeline.model.precision", "float32"),
 )
 STYLE_FLAGS = (
@@ -43,9 +45,10 @@ STYLE_FLAGS = (
     *("--pipeline.model.bake-resolution", "32"),
     *("--pipeline.model.precision", "float32"),
 )
+STYLISED_SAMPLES = ("stylised samples, no residual density", "stylised samples, residual density")
 AXES = {
     "training": ["stage-1 iterations", "width", "levels", "batch"],
-    "quadrature": ["samples", "steps", "skipping", "stopping"],
+    "quadrature": ["samples", "steps", "skipping", "stopping", *STYLISED_SAMPLES],
     "fine-field": ["hash levels", "resolution", "table"],
     "style": ["stage-2 iterations", "feature size", "style features"],
     "rendering": ["baking"],
@@ -116,7 +119,17 @@ def test_more_samples_come_closer_to_the_converged_render(content):
     assert errors[-1] < errors[0]
     (axis,) = (axis for axis in content["axes"] if axis["name"] == "samples")
     assert axis["observed_order"] > 0
-    assert "256 samples" in axis["note"]
+    assert "256 even samples" in axis["note"]
+
+
+@pytest.mark.parametrize("name", STYLISED_SAMPLES)
+def test_few_samples_of_the_stylised_field_are_compared_with_16_times_as_many(content, name):
+    points = points_of(content, name)
+    assert [setting for setting, _ in points] == ["2", "3", "6", "12"]
+    assert points["12", ""]["rmse"]["median"] <= points["2", ""]["rmse"]["median"]
+    (axis,) = (axis for axis in content["axes"] if axis["name"] == name)
+    assert axis["flag"] == "--pipeline.model.num-samples"
+    assert "192 samples" in axis["note"]
 
 
 def test_training_is_one_run_with_several_moments(content):
@@ -192,11 +205,21 @@ def test_a_coarse_run_of_other_views_is_refused(runs, llff_scene):
 
 def test_schedules_end_with_the_iterations_there_are():
     coarse = squeezed(method_config("coarse-fewshot-draft"), 250)
-    assert coarse.max_num_iterations == coarse.optimizers["fields"]["scheduler"].max_steps == 250
-    style = squeezed(method_config("hier-style-draft"), 50)
-    assert style.optimizers["fields"]["scheduler"].milestones == (20, 40)
-    assert (style.pipeline.content_steps, style.pipeline.warm_start_steps) == (25, 10)
-    assert method_config("hier-style-draft").pipeline.content_steps == 100
+    assert coarse.max_num_iterations == 250
+    assert {group["scheduler"].max_steps for group in coarse.optimizers.values()} == {250}
+    preset = method_config("hier-style-draft")
+    style = squeezed(preset, 20)
+    scheduler = style.optimizers["fields"]["scheduler"]
+    assert (scheduler.milestones, scheduler.warm_up) == ((10, 16), 4)
+    assert style.pipeline.warm_start_steps == 10
+    assert preset.pipeline.warm_start_steps == 40
+    # What is at which size of the views, and how the content weight falls there, is in shares of the iterations.
+    ends = [
+        (level.scale, config.pipeline.weights_at(level.first + level.length - 1, level)["content"])
+        for config in (style, preset)
+        for level in config.pipeline.levels(config.max_num_iterations)
+    ]
+    assert ends[:2] == ends[2:]
 
 
 @pytest.mark.parametrize(
