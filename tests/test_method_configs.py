@@ -1,10 +1,11 @@
 """What the methods are set to: for people, for a first look, and as the paper has them."""
 
 import pytest
+import torch
 from nerfstudio.engine.schedulers import MultiStepSchedulerConfig
 
 from sparsestyle_ns.core.schedules import Level, content_weight
-from sparsestyle_ns.engine.training import FusedAdamConfig, MuonConfig
+from sparsestyle_ns.engine.training import FusedAdamConfig, MuonConfig, WarmUpSchedulerConfig
 from sparsestyle_ns.method_configs import method_config
 
 STAGES = ("coarse-fewshot", "hier-style")
@@ -85,3 +86,15 @@ def test_the_papers_methods_add_nothing_to_it():
     assert (model.hash_levels, model.min_resolution, model.max_resolution) == (8, 128, 512)
     assert (model.features_per_level, model.log2_table_size) == (4, 19)
     assert (model.hidden_layers, model.layer_width) == (2, 256)
+
+
+def test_stage_2s_learning_rate_rises_evenly_and_falls_to_a_third_at_each_milestone():
+    config = WarmUpSchedulerConfig(warm_up=4, milestones=(6, 8), gamma=0.33)
+    optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=2.0)
+    schedule = config.setup().get_scheduler(optimizer, 2.0)
+    rates = []
+    for _ in range(10):
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    assert rates == pytest.approx([0.5, 1.0, 1.5, 2.0, 2.0, 2.0, 0.66, 0.66, 0.66 * 0.33, 0.66 * 0.33])
