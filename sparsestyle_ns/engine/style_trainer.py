@@ -26,6 +26,7 @@ from sparsestyle_ns.runs.run_folder import COARSE_METHOD
 from sparsestyle_ns.runs.scene_record import record_scene, save_thumbnail
 from sparsestyle_ns.utils.distributed import from_first_process
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
+from sparsestyle_ns.utils.machine import release_memory
 from sparsestyle_ns.utils.progress import bar
 
 PHOTO_SETTINGS = ("data", "dataparser", "num_views", "view_ids", "max_image_side", "seed", "camera_res_scale_factor")
@@ -84,6 +85,7 @@ class HierStyleTrainer(SparseStyleTrainer):
             self._begin(pipeline)
         self.config = replace(self.config, pipeline=pipeline)
         super().setup(test_mode)
+        release_memory()
         if comms.is_main_process():
             save_thumbnail(self.base_dir, self._painting)
         if self._start_step == 0:
@@ -162,7 +164,10 @@ class HierStyleTrainer(SparseStyleTrainer):
         for state in (writer.EVENT_WRITERS, writer.EVENT_STORAGE, writer.GLOBAL_BUFFER):
             state.clear()
         from_first_process(None)  # the others wait here until it has saved
-        return read_coarse_run(trainer.base_dir)
+        folder = trainer.base_dir
+        del trainer
+        release_memory()  # its fields, optimisers and photos would be there during all of stage 2
+        return read_coarse_run(folder)
 
     def next_command(self) -> List[str]:
         """Looking at it."""

@@ -1,5 +1,6 @@
 """`hier-style`: the coarse field, frozen, and the residual field that stylises it (stage 2)."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional, Tuple, Type
 
@@ -41,7 +42,7 @@ class HierStyleModelConfig(FineFieldConfig, SceneModelConfig):
     """Samples a ray on which the stylised field is looked at, where the coarse field's weight is; None: every step
     that can show, as with a fine-tuned copy of the coarse field, whose weight moves."""
     even_share: float = 0.25
-    """Share of these samples, in [0, 1), that is spread evenly where residual density may add to the geometry."""
+    """Where residual density may add to the geometry, this share of all samples, in [0, 1), is spread evenly besides."""
     occupancy_resolution: int = 128
     """Cells along a side of the grids that say what is empty, and how dense what isn't."""
     min_alpha: float = 0.03
@@ -108,7 +109,8 @@ class HierStyleModel(SceneModel):
         few = None
         if config.num_samples is not None and config.stylised_field == "residual":
             even_share = config.even_share if self.effects.on("residual_density") else 0.0
-            few = FewSamples(self.volume, config.num_samples, even_share)
+            # The even ones come on top of those where the weight is.
+            few = FewSamples(self.volume, math.ceil(config.num_samples / (1.0 - even_share)), even_share)
         return Marching(self.occupancy, config.num_steps, self.space.unbounded, config.min_transmittance, few)
 
     def get_param_groups(self) -> Dict[str, List[Parameter]]:

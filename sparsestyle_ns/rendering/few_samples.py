@@ -9,14 +9,14 @@ short, for which a share of them is spread evenly.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Optional
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestyle_ns.core.occupancy import DensityVolume, PackedSamples, interval_lengths
+from sparsestyle_ns.core.occupancy import DensityVolume, Occupancy, PackedSamples, interval_lengths
 from sparsestyle_ns.core.sampling import even_edges, sample_pdf
 from sparsestyle_ns.core.spaces import Segments
 from sparsestyle_ns.core.volrend import dense_weights, optical_depth
@@ -57,21 +57,29 @@ class Stretches(NamedTuple):
 
 
 @torch.no_grad()
-def cut_into_stretches(segments: Segments, few: FewSamples, num_steps: int, unbounded: bool) -> Stretches:
-    """The stretches of a batch of rays, by what the volume shows on `num_steps` even steps."""
+def cut_into_stretches(
+    segments: Segments, few: FewSamples, num_steps: int, unbounded: bool, occupancy: Optional[Occupancy] = None
+) -> Stretches:
+    """The stretches of a batch of rays, by what the volume shows on `num_steps` even steps in occupied cells."""
     rays = segments.hit.nonzero().squeeze(-1)
     edges = even_edges(len(segments.hit), num_steps, rays.device)
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
     lengths = interval_lengths(segments, edges, unbounded)
-    density, lengths = few.volume.density(segments.positions(middle))[rays], lengths[rays]
-    endless = lengths.isinf()
-    lengths = torch.where(endless, 0.0, lengths)
+    positions = segments.positions(middle)
+    density, lengths = few.volume.density(positions)[rays], lengths[rays]
+    is_passed = lengths.isinf()
+    if occupancy is not None:
+        is_passed = is_passed | ~occupancy.contains(positions)[rays]
+    lengths = torch.where(is_passed, 0.0, lengths)
     depth = optical_depth(density, lengths)
     weights = dense_weights(depth)
     share = max(few.even_share, LEAST_EVEN_SHARE)
-    mass = (1.0 - share) * weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-12) + share / num_steps
+    mass = torch.lerp(_shares(weights), _shares(lengths), share)
+    if not unbounded:  # rays that meet nothing but empty cells have no samples; here they still have an endless step
+        (seen,) = (mass.sum(dim=-1) > 0.0).nonzero(as_tuple=True)
+        rays, depth, lengths, mass = rays[seen], depth[seen], lengths[seen], mass[seen]
 
-    cuts = sample_pdf(edges[rays], mass, 2 * few.count)
+    cuts = sample_pdf(edges[rays], mass + 1e-9, 2 * few.count)
     borders, s = cuts[:, ::2].contiguous(), cuts[:, 1::2]
     step = (borders * num_steps).long().clamp(max=num_steps - 1)
     part = borders * num_steps - step
@@ -85,6 +93,11 @@ def cut_into_stretches(segments: Segments, few: FewSamples, num_steps: int, unbo
     row, _ = is_kept.nonzero(as_tuple=True)
     on_ray, s = rays[row], s[is_kept]
     return Stretches(PackedSamples(on_ray, s, lengths[is_kept], segments.positions(s, on_ray)), depth[is_kept])
+
+
+def _shares(values: Float[Tensor, "rays steps"]) -> Float[Tensor, "rays steps"]:
+    """Each row over its sum; 0 where that is 0."""
+    return values / values.sum(dim=-1, keepdim=True).clamp(min=1e-12)
 
 
 def _between(

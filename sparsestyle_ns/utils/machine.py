@@ -2,6 +2,8 @@
 
 import atexit
 import contextlib
+import ctypes
+import gc
 import importlib.metadata
 import os
 import platform
@@ -28,6 +30,13 @@ def synchronize(device: torch.device) -> None:
     """Waits until a GPU has done what it was told."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
+
+
+def release_memory() -> None:
+    """Gives back to the system what nobody uses any more, which Python and the C library would keep for later."""
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):  # another C library than GNU's
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 class PeakMemory:
