@@ -77,8 +77,7 @@ def feature_works(side: int, device: torch.device) -> Dict[str, Work]:
         (gradient,) = torch.autograd.grad(rows.float().square().mean(), leaf)
         return gradient
 
-    state = {name: value.clone() for name, value in network.state_dict().items()}
-    turned = type(network)(network.description, state, torch.contiguous_format).to(device)
+    turned = copy.deepcopy(network).to(memory_format=torch.contiguous_format)
     works: Dict[str, Work] = {USUAL: lambda: work(network), "channels first": lambda: work(turned)}
     for name, context in formats(device).items():
         works[name] = lambda context=context: work(network, context)
