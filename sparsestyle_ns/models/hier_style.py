@@ -42,7 +42,7 @@ class HierStyleModelConfig(FineFieldConfig, SceneModelConfig):
     """Samples a ray on which the stylised field is looked at, where the coarse field's weight is; None: every step
     that can show, as with a fine-tuned copy of the coarse field, whose weight moves."""
     even_share: float = 0.25
-    """Where residual density may add to the geometry, this share of all samples, in [0, 1), is spread evenly besides."""
+    """Where residual density may add to the geometry, this share of all samples, in [0, 1), lies evenly besides."""
     occupancy_resolution: int = 128
     """Cells along a side of the grids that say what is empty, and how dense what isn't."""
     min_alpha: float = 0.03

@@ -9,14 +9,14 @@ short, for which a share of them is spread evenly.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, Optional
+from typing import NamedTuple, Optional, Tuple
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestyle_ns.core.occupancy import DensityVolume, Occupancy, PackedSamples, interval_lengths
+from sparsestyle_ns.core.occupancy import DensityVolume, Occupancy, PackedSamples
 from sparsestyle_ns.core.sampling import even_edges, sample_pdf
 from sparsestyle_ns.core.spaces import Segments
 from sparsestyle_ns.core.volrend import dense_weights, optical_depth
@@ -27,6 +27,10 @@ MOST_CORRECTION = 10.0
 """A volume's density counts as at most so many times too small or too large."""
 LEAST_EVEN_SHARE = 0.05
 """Of the stretches, so that what the volume has missed is found."""
+
+FINE_STEPS, FINE_EVEN_SHARE = 64, 0.3
+"""Steps of the second look at the volume, and which share of them is spread evenly over what is occupied."""
+TINY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -60,39 +64,49 @@ class Stretches(NamedTuple):
 def cut_into_stretches(
     segments: Segments, few: FewSamples, num_steps: int, unbounded: bool, occupancy: Optional[Occupancy] = None
 ) -> Stretches:
-    """The stretches of a batch of rays, by what the volume shows on `num_steps` even steps in occupied cells."""
-    rays = segments.hit.nonzero().squeeze(-1)
-    edges = even_edges(len(segments.hit), num_steps, rays.device)
-    middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
-    lengths = interval_lengths(segments, edges, unbounded)
-    positions = segments.positions(middle)
-    density, lengths = few.volume.density(positions)[rays], lengths[rays]
-    is_passed = lengths.isinf()
-    if occupancy is not None:
-        is_passed = is_passed | ~occupancy.contains(positions)[rays]
-    lengths = torch.where(is_passed, 0.0, lengths)
-    depth = optical_depth(density, lengths)
-    weights = dense_weights(depth)
-    share = max(few.even_share, LEAST_EVEN_SHARE)
-    mass = torch.lerp(_shares(weights), _shares(lengths), share)
-    if not unbounded:  # rays that meet nothing but empty cells have no samples; here they still have an endless step
-        (seen,) = (mass.sum(dim=-1) > 0.0).nonzero(as_tuple=True)
-        rays, depth, lengths, mass = rays[seen], depth[seen], lengths[seen], mass[seen]
+    """The stretches of a batch of rays, by what the volume shows in occupied cells.
 
-    cuts = sample_pdf(edges[rays], mass + 1e-9, 2 * few.count)
+    It is looked at on `num_steps` even steps, and then on `FINE_STEPS` that lie where the weight is: on even steps
+    alone, neighbouring pixels see a surface in different steps, which shows as ripples like the grain of wood.
+    """
+    edges = even_edges(len(segments.hit), num_steps, segments.hit.device)
+    end = 0.5 * (edges[:, -2:-1] + edges[:, -1:])
+    if unbounded:  # the last step is endless, and has a sample of its own
+        edges = edges[:, :-1]
+    depth, lengths = _looked_at(segments, edges, few.volume, occupancy)
+    near = F.max_pool1d(dense_weights(depth)[:, None], kernel_size=3, stride=1, padding=1)[:, 0]
+    edges = sample_pdf(edges, torch.lerp(_shares(near), _shares(lengths), FINE_EVEN_SHARE) + TINY, FINE_STEPS)
+    depth, lengths = _looked_at(segments, edges, few.volume, occupancy)
+    share = max(few.even_share, LEAST_EVEN_SHARE)
+    mass = torch.lerp(_shares(dense_weights(depth)), _shares(lengths), share)
+
+    cuts = sample_pdf(edges, mass + TINY, 2 * few.count)
     borders, s = cuts[:, ::2].contiguous(), cuts[:, 1::2]
-    step = (borders * num_steps).long().clamp(max=num_steps - 1)
-    part = borders * num_steps - step
+    step = torch.searchsorted(edges, borders, right=True).clamp(1, FINE_STEPS) - 1
+    start = edges.gather(-1, step)
+    part = ((borders - start) / (edges.gather(-1, step + 1) - start).clamp(min=TINY)).clamp(0.0, 1.0)
     depth, lengths = (_between(values, step, part) for values in (depth, lengths))
-    is_kept = dense_weights(depth) > LEAST_WEIGHT if few.even_share == 0.0 else lengths > 0.0
+    is_kept = lengths > 0.0
+    if few.even_share == 0.0:
+        is_kept &= dense_weights(depth) > LEAST_WEIGHT
     if unbounded:
-        s, depth = torch.cat([s, middle[rays, -1:]], dim=-1), F.pad(depth, (0, 1))
-        lengths = F.pad(lengths, (0, 1), value=torch.inf)
-        reached = torch.exp(-depth.sum(dim=-1, keepdim=True)) > LEAST_WEIGHT
-        is_kept = torch.cat([is_kept, reached], dim=-1)
-    row, _ = is_kept.nonzero(as_tuple=True)
-    on_ray, s = rays[row], s[is_kept]
-    return Stretches(PackedSamples(on_ray, s, lengths[is_kept], segments.positions(s, on_ray)), depth[is_kept])
+        reached = segments.hit[:, None] & (torch.exp(-depth.sum(dim=-1, keepdim=True)) > LEAST_WEIGHT)
+        is_kept, s = torch.cat([is_kept, reached], dim=-1), torch.cat([s, end], dim=-1)
+        depth, lengths = F.pad(depth, (0, 1)), F.pad(lengths, (0, 1), value=torch.inf)
+    rays, _ = is_kept.nonzero(as_tuple=True)
+    s = s[is_kept]
+    return Stretches(PackedSamples(rays, s, lengths[is_kept], segments.positions(s, rays)), depth[is_kept])
+
+
+def _looked_at(
+    segments: Segments, edges: Float[Tensor, "rays edges"], volume: DensityVolume, occupancy: Optional[Occupancy]
+) -> Tuple[Float[Tensor, "rays steps"], Float[Tensor, "rays steps"]]:
+    """Optical depths by the volume, and lengths, of steps; 0 in empty cells."""
+    positions = segments.positions(0.5 * (edges[:, 1:] + edges[:, :-1]))
+    lengths = torch.where(segments.hit[:, None], segments.lengths(edges), 0.0)
+    if occupancy is not None:
+        lengths = torch.where(occupancy.contains(positions), lengths, 0.0)
+    return optical_depth(volume.density(positions), lengths), lengths
 
 
 def _shares(values: Float[Tensor, "rays steps"]) -> Float[Tensor, "rays steps"]:

@@ -153,9 +153,7 @@ def frozen_field(
     """The samples of a batch of rays, with σ_c and e_c: few, or every step that can show."""
     if marching.few is None:
         return visible_samples(field.density_and_feature, segments, marching)
-    stretches = cut_into_stretches(
-        segments, marching.few, marching.num_steps, marching.unbounded, marching.occupancy
-    )
+    stretches = cut_into_stretches(segments, marching.few, marching.num_steps, marching.unbounded, marching.occupancy)
     density, feature = field.density_and_feature(stretches.samples.positions)
     return stretches.samples, stretches.density(marching.few.volume, density), feature
 
