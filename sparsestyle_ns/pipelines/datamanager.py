@@ -174,10 +174,10 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         if not hasattr(self, "pixels"):
             self.pixels = self.pixels_at(1.0)
 
-    @functools.cache  # noqa: B019 - a run has one data manager, as long as it lives
     def pixels_at(self, scale: float) -> TrainingPixels:
         """The training photos, reduced to a share of their size, with all their rays."""
-        return gather_pixels(self.train_dataset, self.device, scale)
+        loaded = scale == 1.0 and hasattr(self, "pixels")
+        return self.pixels if loaded else gather_pixels(self.train_dataset, self.device, scale)
 
     @property
     def photo_side(self) -> int:

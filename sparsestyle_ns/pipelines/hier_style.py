@@ -113,7 +113,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         """
         weights = {name: weight for name, weight in self.loss_weights.items() if weight > 0}
         if "content" in weights:
-            start = 1.0 if level.first == 0 else self.content_restart
+            start = 1.0 if level.first == 0 else max(self.content_restart, self.content_decay)
             fall = start * weights["content"], self.content_decay / start, self.content_share * level.length
             weights["content"] = content_weight(step - level.first, *fall)
         return weights

@@ -72,13 +72,10 @@ class SceneViews:
         self.by_scale: Dict[float, List[ContentView]] = {scale: [] for scale in scales}
         novel = cameras_between(manager.train_dataset.cameras, novel_views)
         work = [(scale, view) for scale in scales for view in (*range(self.num_photos), *novel)]
+        pixels = {scale: manager.pixels_at(scale) for scale in scales}
         for scale, view in track(work, "Freezing views"):
             is_photo = isinstance(view, int)
-            made = (
-                self._photo_view(manager.pixels_at(scale), view)
-                if is_photo
-                else self._novel_view(at_scale(view, scale))
-            )
+            made = self._photo_view(pixels[scale], view) if is_photo else self._novel_view(at_scale(view, scale))
             self.by_scale[scale].append(made)
 
     @property
