@@ -87,7 +87,10 @@ class ResidualField(nn.Module):
         """
         hidden = [layer for layer in self.mlp.modules() if isinstance(layer, nn.Linear)]
         heads = [self.color_head] if self.density_head is None else [self.color_head, self.density_head]
-        logits = blocked_mlp((self.grid.interpolate(location), feature), hidden, heads, self.thinning).float()
+        encoded = self.grid.interpolate(location)
+        if torch.is_autocast_enabled(kind := encoded.device.type):  # half of what is kept for the backward pass
+            encoded = encoded.to(torch.get_autocast_dtype(kind))
+        logits = blocked_mlp((encoded, feature), hidden, heads, self.thinning).float()
         # In half precision a sigmoid reaches 1 at a logit of 6, and has no gradient from there on.
         if self.density_head is None:
             return coarse_density, torch.sigmoid(logits)

@@ -41,7 +41,7 @@ class HierStyleModelConfig(FineFieldConfig, SceneModelConfig):
     num_samples: Optional[int] = 4
     """Samples a ray on which the stylised field is looked at, where the coarse field's weight is; None: every step
     that can show, as with a fine-tuned copy of the coarse field, whose weight moves."""
-    even_share: float = 0.25
+    even_share: float = 0.2
     """Where residual density may add to the geometry, this share of all samples, in [0, 1), lies evenly besides."""
     occupancy_resolution: int = 128
     """Cells along a side of the grids that say what is empty, and how dense what isn't."""

@@ -42,7 +42,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     view_scales: Tuple[float, ...] = (0.5, 1.0)
     """Sizes at which the views are stylised, one after another, as shares of the photos'; the last is the one that
     counts, and iterations before it are quick."""
-    scale_shares: Tuple[float, ...] = (0.6, 0.4)
+    scale_shares: Tuple[float, ...] = (0.65, 0.35)
     """Shares of the iterations at these sizes."""
     feature_side: Optional[int] = None
     """Longer side, in pixels, at which the feature network sees rendered views of the photos' size. None: theirs."""
@@ -58,7 +58,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     """T, the iterations in which it falls, as a share of those at a size of the views."""
     content_restart: float = 0.3
     """The share of the content loss's weight with which each size but the first begins."""
-    warm_start_steps: int = 40
+    warm_start_steps: int = 30
     """Steps, before the first iteration, in which c_f is fitted to whole photos; 0 is the paper's start from grey."""
     novel_views: int = 0
     """Views between the photos to stylise as well, with the coarse render as their content."""
