@@ -128,7 +128,9 @@ def compare(versions: Dict[str, Version], side: int, is_last: bool, report: Repo
         if "before" in found:
             ratio = ratio_of_pairs(found["before"], found["ours"])
             what = f"{IN_WORDS[work]}, {report.extra['scene']} at {size}"
-            report.add_row(f"before_{work}_{side}", what, _earlier(report), ratio, TARGETS.get(f"{work}_{side}", TARGETS[work]))
+            report.add_row(
+                f"before_{work}_{side}", what, _earlier(report), ratio, TARGETS.get(f"{work}_{side}", TARGETS[work])
+            )
 
 
 def _earlier(report: Report) -> str:
