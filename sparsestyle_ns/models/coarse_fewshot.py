@@ -42,7 +42,7 @@ class CoarseFewShotModelConfig(SceneModelConfig):
     _target: Type = field(default_factory=lambda: CoarseFewShotModel)
     num_samples: int = 24
     """Samples a ray in training."""
-    num_eval_samples: int = 8
+    num_eval_samples: int = 6
     """Samples a ray in pictures of a trained field, where its weight is; while it learns, as many as in training."""
     num_steps: int = 128
     """Even steps along a ray on which the weight of a trained field is looked for, in a volume of its densities."""
