@@ -212,7 +212,7 @@ def test_schedules_end_with_the_iterations_there_are():
     scheduler = style.optimizers["fields"]["scheduler"]
     assert (scheduler.milestones, scheduler.warm_up) == ((10, 16), 4)
     assert style.pipeline.warm_start_steps == 8
-    assert preset.pipeline.warm_start_steps == 40
+    assert preset.pipeline.warm_start_steps == 30
     # What is at which size of the views, and how the content weight falls there, is in shares of the iterations.
     ends = [
         (level.scale, config.pipeline.weights_at(level.first + level.length - 1, level)["content"])
