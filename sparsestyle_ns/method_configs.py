@@ -130,7 +130,7 @@ hier_style_draft = variant(
     },
 )
 
-THE_PAPER = "with the paper's own settings and nothing added: hours on a CPU, for comparisons."
+THE_PAPER = "with the paper's own settings: hours on a CPU, for comparisons."
 coarse_fewshot_paper = variant(
     coarse_fewshot,
     "-paper",
