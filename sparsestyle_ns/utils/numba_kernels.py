@@ -5,7 +5,6 @@ Numba's own thread pools can't be entered from two threads at once, as a viewer 
 
 import functools
 import sys
-import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Callable, ParamSpec, Sequence, Tuple, TypeVar
 
@@ -28,13 +27,18 @@ def kernel(function: Callable[..., None]) -> Callable[..., None]:
 def run_on_threads(function: Callable[..., None], parts: Sequence[Tuple]) -> None:
     """Calls `function(*part)` for each part, on as many threads as torch uses; an error in one is raised here."""
     threads = min(torch.get_num_threads(), len(parts))
-    # Python's end has begun where the main thread is over, and then no pool takes work any more.
-    if threads <= 1 or not threading.main_thread().is_alive():
+    if threads <= 1:
         for part in parts:
             function(*part)
         return
     with ThreadPoolExecutor(threads) as pool:
-        for result in [pool.submit(function, *part) for part in parts]:
+        results = []
+        for part in parts:
+            try:
+                results.append(pool.submit(function, *part))
+            except RuntimeError:  # Python's end has begun, at which no pool takes work any more
+                function(*part)
+        for result in results:
             result.result()
 
 

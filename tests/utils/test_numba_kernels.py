@@ -50,16 +50,23 @@ def test_one_thread_means_the_callers_own(two_threads):
     assert seen == [threading.current_thread()] * 2
 
 
-def test_work_goes_on_while_python_ends():
+@pytest.mark.parametrize("moment", ["pools_closed", "main_thread_over"])
+def test_work_goes_on_while_python_ends(moment):
     """A thread that is at work then may come to its end: pools take no work any more."""
     script = """
 import sys, threading, time
+pools_closed = threading.Event()
+
+def end():
+    pools_closed.set()
+    time.sleep(0.5)
+
+threading._register_atexit(end)  # called after the pools', which is registered later
 import torch
 from sparsestyle_ns.utils.numba_kernels import run_on_threads
 
 def work():
-    threading.main_thread().join()
-    time.sleep(0.2)
+    threading.main_thread().join() if sys.argv[1] == "main_thread_over" else pools_closed.wait()
     done = []
     run_on_threads(lambda: done.append(1), [(), ()])
     print(len(done), flush=True)
@@ -67,7 +74,7 @@ def work():
 torch.set_num_threads(2)
 threading.Thread(target=work).start()
 """
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    ended = subprocess.run([sys.executable, "-c", script, moment], capture_output=True, text=True, timeout=120)
     assert (ended.stdout, ended.stderr) == ("2\n", "")
 
 
