@@ -79,7 +79,7 @@ class _BlockedMLP(torch.autograd.Function):
         if ctx.needs_input_grad[2]:
             own = torch.cat(first)
             if kept is not None:
-                own = own.new_zeros(saved[0].shape).index_copy_(0, kept, own)
+                own = own.new_zeros(saved[0].shape).index_add_(0, kept, own)
         rest = [None] * (ctx.num_inputs - 1)
         return None, None, own, *rest, *(part.to(like.dtype) for part, like in zip(found, parameters, strict=True))
 

@@ -16,6 +16,11 @@ from torch import Tensor, nn
 from sparsestyle_ns.core.precision import at_least_float32
 
 
+MULTIPLE = 1024
+"""The backward pass gets a multiple of so many points: a library may compile a matrix product anew for each shape, and
+oneDNN keeps a thousand of these, half a gigabyte."""
+
+
 class Thinning(NamedTuple):
     """How many points the backward pass is spared."""
 
@@ -28,7 +33,10 @@ class Thinning(NamedTuple):
 def thin(
     gradients: Float[Tensor, "points channels"], thinning: Thinning
 ) -> Tuple[Int[Tensor, " kept"], Float[Tensor, "kept channels"]]:
-    """The points that stay, ascending, and their gradients over the probabilities with which they do."""
+    """The points that stay, ascending, and their gradients over the probabilities with which they do.
+
+    More than `MULTIPLE` are filled up to a multiple of it, by the last point with a gradient of 0.
+    """
     # In units of the largest number no square overflows, and none underflows that matters.
     largest = torch.linalg.vector_norm(gradients, ord=torch.inf) if gradients.numel() else gradients.new_ones(())
     sizes = torch.linalg.vector_norm(gradients / torch.where(largest > 0, largest, 1.0), dim=-1)
@@ -37,7 +45,9 @@ def thin(
     chance = torch.where(sizes < limit, sizes / limit, 1.0)
     drawn = torch.rand(len(sizes), device=sizes.device, dtype=sizes.dtype, generator=thinning.generator)
     (kept,) = (drawn < chance).nonzero(as_tuple=True)
-    return kept, gradients[kept] / chance[kept, None]
+    gradients = gradients[kept] / chance[kept, None]
+    missing = -len(kept) % MULTIPLE if len(kept) > MULTIPLE else 0
+    return torch.cat([kept, kept[-1:].expand(missing)]), F.pad(gradients, (0, 0, 0, missing))
 
 
 def thinned_mlp(
