@@ -14,7 +14,7 @@ from sparsestyle_ns.utils.errors import InputError
 
 MAX_SPREAD = 45.0
 """Degrees by which a camera of a forward-facing capture may look aside from the mean viewing direction."""
-NUM_FRAMES, ARC_STEP = 24, math.radians(2.0)
+NUM_FRAMES, ARC_STEP = 16, math.radians(2.0)
 """Frames of the measuring path, at least, and the angle between those of an arc."""
 FLIGHT_STEPS = 20
 """Poses of a flight that a frame chooses from, so that its speed can change without jerks."""
