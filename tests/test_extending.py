@@ -18,10 +18,9 @@ from PIL import Image
 from sparsestyle_ns.data.scene_info import SCENE_INFO, SceneInfo, scene_info
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.engine.training import Training
-from sparsestyle_ns.evaluation.held_out import stylisation_figures
+from sparsestyle_ns.evaluation.held_out import StyleFigures
 from sparsestyle_ns.losses.stylization import LOSSES
 from sparsestyle_ns.losses.stylization_loss import PaintingFeatures, StylizationLoss, StylizedView
-from sparsestyle_ns.metrics.image import gram_matrix
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 from sparsestyle_ns.runs.coarse_run import read_coarse_run
@@ -135,7 +134,7 @@ def test_a_new_loss_is_trained_measured_and_has_a_flag(runs: SimpleNamespace, mo
     assert "brightness" in told[0].metrics()
 
     view, targets = pipeline.task.levels[-1].views[0].picture, pipeline.targets
-    figures = stylisation_figures(targets, gram_matrix(targets.style_rows()), view, view.flip(0), None)
+    figures = StyleFigures(targets).of(view, view.flip(0), None)
     assert figures["brightness_loss"] == pytest.approx(figures["brightness_loss_before"], abs=1e-6)
 
 

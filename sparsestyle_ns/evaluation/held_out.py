@@ -23,6 +23,7 @@ from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID
 from sparsestyle_ns.metrics.consistency import RANGES, PathGeometry
 from sparsestyle_ns.metrics.image import gram_distance, gram_matrix, image_metrics, psnr, structural_similarity
+from sparsestyle_ns.metrics.style_distance import StyleDistance
 from sparsestyle_ns.metrics.warping import MIN_COVERAGE, Pinhole, Surface
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
@@ -93,7 +94,7 @@ def evaluate_held_out(
 
     Coarse model: `psnr` in dB, `ssim`, `lpips` and `st_lpips` where there are weights, and `effective_samples`.
     Stylised model: the same of the coarse field with the prefix `coarse_`; `content_ssim`; with `targets` what
-    `stylisation_figures` gives and, where there are weights for it, `art_fid` of all views, with photos as content; and
+    `StyleFigures` gives and, where there are weights for it, `art_fid` of all views, with photos as content; and
     the consistency of frames on the measuring path (`PathFrames.figures`), where there are two training cameras.
 
     Args:
@@ -132,17 +133,17 @@ class _StyleMeasure:
     """What is measured of a stylised model's views."""
 
     def __init__(self, model: HierStyleModel, targets: Optional[StyleTargets], baked: bool) -> None:
-        self.model, self.targets, self.baked = model, targets, baked
-        self.style_gram = None if targets is None else gram_matrix(targets.style_rows())
+        self.model, self.baked = model, baked
+        self.style = None if targets is None else StyleFigures(targets)
         self.art_fid = None if targets is None else ArtFID.against(targets.style_image)
 
     def view(self, outputs: Dict[str, Tensor], photo: Tensor, camera: Cameras) -> Dict[str, float]:
         model, coarse, stylised = self.model, outputs["rgb_coarse"], outputs["rgb"]
         values = {f"coarse_{key}": value for key, value in image_metrics(coarse, photo).items()}
         values["content_ssim"] = structural_similarity(stylised, photo)
-        if self.targets is not None:
+        if self.style is not None:
             covered = None if model.background is None else outputs["accumulation"].squeeze(-1)
-            values.update(stylisation_figures(self.targets, self.style_gram, coarse, stylised, covered))
+            values.update(self.style.of(coarse, stylised, covered))
         if self.art_fid is not None:
             self.art_fid.add(stylised, photo)
         if self.baked:
@@ -159,28 +160,37 @@ def exact_outputs(model: Union[CoarseFewShotModel, HierStyleModel], camera: Came
         return model.get_outputs_for_camera(camera)
 
 
-def stylisation_figures(
-    targets: StyleTargets,
-    style_gram: Float[Tensor, "C C"],
-    coarse: Float[Tensor, "H W 3"],
-    stylised: Float[Tensor, "H W 3"],
-    accumulation: Optional[Float[Tensor, "H W"]],
-) -> Dict[str, float]:
-    """How strong the style of a view is, before (`…_before`) and after stylising, and how far its content has moved.
+class StyleFigures:
+    """What is measured of views against a painting."""
 
-    `style_loss` and `content_loss` are Eq. 5's: nearest neighbour feature matching, and the features' distance from the
-    unstylised view; other losses of `targets` are `NAME_loss`, and `gram_distance` is that of `metrics.image`. With
-    `accumulation`, only where the scene covers the picture: a background can't be stylised.
-    """
-    content = targets.features(coarse)
-    figures = {}
-    for suffix, picture in (("_before", coarse), ("", stylised)):
-        view = targets.view(picture, content, accumulation)
-        losses = targets.losses(view)
-        figures.update({f"{name}_loss{suffix}": float(value) for name, value in losses.items()})
-        figures[f"gram_distance{suffix}"] = float(gram_distance(gram_matrix(view.features), style_gram))
-    figures.pop("content_loss_before", None)
-    return figures
+    def __init__(self, targets: StyleTargets) -> None:
+        self.targets = targets
+        self.gram = gram_matrix(targets.style_rows())
+        self.distance = StyleDistance(targets.style_picture)
+
+    @torch.no_grad()
+    def of(
+        self,
+        coarse: Float[Tensor, "H W 3"],
+        stylised: Float[Tensor, "H W 3"],
+        accumulation: Optional[Float[Tensor, "H W"]],
+    ) -> Dict[str, float]:
+        """How strong a view's style is, before (`…_before`) and after stylising, and how far its content has moved.
+
+        `style_loss` and `content_loss` are Eq. 5's: nearest neighbour feature matching, and the features' distance from
+        the unstylised view; other losses of `targets` are `NAME_loss`, `gram_distance` is that of `metrics.image`, and
+        the rest are of `StyleDistance`. With `accumulation`, only where the scene covers the picture: a background
+        can't be stylised.
+        """
+        content, figures = self.targets.features(coarse), {}
+        for suffix, picture in (("_before", coarse), ("", stylised)):
+            view = self.targets.view(picture, content, accumulation)
+            found = {f"{name}_loss": float(value) for name, value in self.targets.losses(view).items()}
+            found["gram_distance"] = float(gram_distance(gram_matrix(view.features), self.gram))
+            found |= self.distance.figures(picture, accumulation)
+            figures |= {f"{name}{suffix}": value for name, value in found.items()}
+        figures.pop("content_loss_before", None)
+        return figures
 
 
 @torch.no_grad()

@@ -19,6 +19,9 @@ LABELS: Dict[str, Tuple[str, int]] = {
     "effective_samples": ("effective samples a ray ↓", 2),
     "style_loss": ("NNFM to the style ↓", 4),
     "gram_distance": ("Gram distance to the style ↓", 4),
+    "texture_distance": ("texture distance to the style ↓", 3),
+    "color_distance": ("colour distance to the style ↓", 3),
+    "colors_used": ("share of its colours used ↑", 2),
     "art_fid": ("ArtFID ↓", 2),
     "content_loss": ("feature distance to the content ↓", 3),
     "content_ssim": ("SSIM to the photo ↑", 3),
@@ -27,7 +30,9 @@ LABELS: Dict[str, Tuple[str, int]] = {
 }
 """A figure's name in words, with the direction that is better, and its decimals."""
 COARSE_QUALITY = ("psnr", "ssim", "lpips", "st_lpips", "effective_samples")
-STYLE_AND_CONTENT = ("style_loss", "gram_distance", "art_fid", "content_loss")
+STYLE = ("style_loss", "gram_distance", "texture_distance", "color_distance", "colors_used")
+"""Figures that an unstylised view has too."""
+STYLE_AND_CONTENT = (*STYLE, "art_fid", "content_loss")
 PERCEPTUAL = ("rmse", "ssim", "lpips", "st_lpips")
 CONSISTENCY = [(f"{part}_{kind}", kind, f"{part} ") for part in ("short", "long") for kind in PERCEPTUAL]
 """Columns of short- and long-range consistency, for `table_of`."""
@@ -85,10 +90,12 @@ def report_tables(means: Dict[str, float], num_views: int) -> List[Table]:
     tables = [table_of(f"Coarse field, {views}", quality, [("coarse", means)])]
     if not prefix:
         return tables
-    kept = [(key, key, "") for key in (*STYLE_AND_CONTENT, "content_ssim", "baked_psnr")]
-    before = {key: means.get(f"{key}_before") for key in ("style_loss", "gram_distance")}
+    style = [(key, key, "") for key in STYLE]
+    kept = [(key, key, "") for key in ("art_fid", "content_loss", "content_ssim", "baked_psnr")]
+    before = {key: means.get(f"{key}_before") for key in STYLE}
     rows = [("unstylised", before), ("stylised", means)]
-    tables.append(table_of(f"Style and content, {views}", kept, rows, why_left_out(means)))
+    tables.append(table_of(f"Style, {views}", style, rows))
+    tables.append(table_of(f"Style and content, {views}", kept, [("stylised", means)], why_left_out(means)))
     if "short_rmse" in means:
         ceiling = {key[len("ceiling_") :]: value for key, value in means.items() if key.startswith("ceiling_")}
         columns = [*CONSISTENCY, *((f"{part}_visible", "visible", f"{part} ") for part in ("short", "long"))]

@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from sparsestyle_ns.core.precision import at_least_float32
 
-
 MULTIPLE = 1024
 """The backward pass gets a multiple of so many points: a library may compile a matrix product anew for each shape, and
 oneDNN keeps a thousand of these, half a gigabyte."""

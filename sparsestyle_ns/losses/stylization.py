@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestyle_ns.core.feature_maps import covered_rows, feature_rows
 from sparsestyle_ns.losses.content import ContentLoss
 from sparsestyle_ns.losses.nnfm import NNFMLoss
 from sparsestyle_ns.losses.stylization_loss import PaintingFeatures, StylizationLoss, StylizedView
@@ -50,28 +51,12 @@ def fit_side(image: Float[Tensor, "B C H W"], longer_side: int, smallest_side: i
     )
 
 
-def feature_rows(features: Float[Tensor, "B C h w"]) -> Float[Tensor, "rows C"]:
-    """A feature map's vectors, one a row."""
-    return features.permute(0, 2, 3, 1).flatten(0, 2)
-
-
 def sample_rows(rows: Float[Tensor, "rows C"], count: int) -> Float[Tensor, "kept C"]:
     """`count` of the rows, drawn at random but the same each time, in their order; all where there are no more."""
     if count >= len(rows):
         return rows
     drawn = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:count]
     return rows[drawn.sort().values.to(rows.device)]
-
-
-def covered_rows(
-    features: Float[Tensor, "1 C h w"], accumulation: Optional[Float[Tensor, "H W"]]
-) -> Float[Tensor, "rows C"]:
-    """Those of a feature map's vectors that show the scene; all where no pixel does, or without `accumulation`."""
-    rows = feature_rows(features)
-    if accumulation is None:
-        return rows
-    covered = F.interpolate(accumulation[None, None].float(), size=features.shape[-2:], mode="area").flatten() > 0.5
-    return rows[covered] if covered.any() else rows
 
 
 class StyleTargets:
@@ -106,11 +91,15 @@ class StyleTargets:
         """The network's view of a picture."""
         return self.backbone(fit_side(image.permute(2, 0, 1)[None], self.feature_side, self.backbone.smallest_side))
 
+    @property
+    def style_picture(self) -> Float[Tensor, "3 h w"]:
+        """The style image at the size at which the network sees it."""
+        return fit_side(self.style_image[None], self.style_side, self.backbone.smallest_side)[0]
+
     @torch.no_grad()
     def style_rows(self) -> Float[Tensor, "rows C"]:
         """The style image's feature vectors, as the network gives them."""
-        image = fit_side(self.style_image[None], self.style_side, self.backbone.smallest_side)
-        return feature_rows(self.backbone(image))
+        return feature_rows(self.backbone(self.style_picture[None]))
 
     def view(
         self,

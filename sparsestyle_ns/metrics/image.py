@@ -90,12 +90,12 @@ class ShiftTolerantLPIPS:
 
 
 @functools.cache
-def _load_st_lpips() -> Optional[Metric]:
+def _load_st_lpips() -> Optional[ShiftTolerantLPIPS]:
     path = shift_tolerant_file("alex_shift_tolerant.pth")
     return path and ShiftTolerantLPIPS(read_state(path))
 
 
-def st_lpips_metric(size: Tuple[int, ...]) -> Optional[Metric]:
+def st_lpips_metric(size: Tuple[int, ...]) -> Optional[ShiftTolerantLPIPS]:
     """ST-LPIPS for pictures of a height and width, on the CPU; None where these are too small or its weights gone."""
     return _load_st_lpips() if min(size) >= MIN_SHIFT_TOLERANT_SIDE else None
 

@@ -8,7 +8,7 @@ from typing import Dict, List, Mapping, Sequence, Tuple
 from sparsestyle_ns.data.parser_choice import parse_dataparser
 from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.engine.previews import preview_path
-from sparsestyle_ns.evaluation.tables import COARSE_QUALITY, CONSISTENCY, STYLE_AND_CONTENT, Table, table_of
+from sparsestyle_ns.evaluation.tables import COARSE_QUALITY, CONSISTENCY, STYLE, STYLE_AND_CONTENT, Table, table_of
 from sparsestyle_ns.metrics.art_fid import why_left_out
 from sparsestyle_ns.runs.scene_record import SceneRecord
 from sparsestyle_ns.studies.baselines import can_transfer, smooth_along_flow, transfer_frames
@@ -203,7 +203,7 @@ def consistency_table(measured: Mapping[str, RunFigures], with_paper: bool) -> T
 def style_table(measured: Mapping[str, RunFigures]) -> Table:
     """Style strength and content of each row."""
     ours = measured["ours"].figures
-    before = {key: ours[f"{key}_before"] for key in ("style_loss", "gram_distance")}
+    before = {key: ours.get(f"{key}_before") for key in STYLE}
     rows = [*((name, row.figures) for name, row in measured.items()), ("the unstylised scene of ours", before)]
     title = "Style strength, and content kept, against the unstylised frames"
     columns = [(key, key, "") for key in (*STYLE_AND_CONTENT, "unstylised_ssim")]

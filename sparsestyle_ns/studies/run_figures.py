@@ -15,10 +15,9 @@ from torchvision.utils import save_image
 
 from sparsestyle_ns.core.camera_paths import measuring_path
 from sparsestyle_ns.engine.loading import evaluate_run, load_run
-from sparsestyle_ns.evaluation.held_out import PathFrames, render_path, saved_report, stylisation_figures
-from sparsestyle_ns.losses.stylization import StyleTargets
+from sparsestyle_ns.evaluation.held_out import PathFrames, StyleFigures, render_path, saved_report
 from sparsestyle_ns.metrics.art_fid import ArtFID, missing_weights
-from sparsestyle_ns.metrics.image import gram_matrix, has_lpips, structural_similarity
+from sparsestyle_ns.metrics.image import has_lpips, structural_similarity
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import REPORT_FILE
@@ -40,7 +39,7 @@ class RunFigures:
     """What a row of a table shows."""
 
     figures: Dict[str, float]
-    """As `PathFrames.figures` and `stylisation_figures` name them, and `unstylised_ssim`."""
+    """As `PathFrames.figures` and `StyleFigures` name them, and `unstylised_ssim`."""
     pictures: List[Path]
     """PNG files of the path's first, middle and last frame."""
     coarse_pictures: List[Path] = field(default_factory=list)
@@ -52,18 +51,18 @@ class PaintingMeasure:
 
     def __init__(self, painting: Path) -> None:
         self.painting = painting
-        self._targets: Optional[StyleTargets] = None
+        self._style: Optional[StyleFigures] = None
 
     def figures(self, frames: PathFrames, settings: HierStylePipelineConfig) -> Dict[str, float]:
         """Means over some frames of style strength and content kept, and their ArtFID; by a run's network and sizes."""
-        if self._targets is None:
+        if self._style is None:
             settings, side = replace(settings, style_image=self.painting), max(frames.stylised[0].shape[:2])
-            self._targets = settings.targets_of(*settings.load_style(), torch.device("cpu"), side)
-        values, art_fid, gram = [], ArtFID.against(self._targets.style_image), gram_matrix(self._targets.style_rows())
+            self._style = StyleFigures(settings.targets_of(*settings.load_style(), torch.device("cpu"), side))
+        values, art_fid = [], ArtFID.against(self._style.targets.style_image)
         for index in track(range(0, len(frames.stylised), STYLE_EVERY), "Style and content"):
             stylised, coarse = frames.stylised[index], frames.coarse[index]
             covered = frames.surfaces[index].covered.float()
-            figures = stylisation_figures(self._targets, gram, coarse, stylised, covered)
+            figures = self._style.of(coarse, stylised, covered)
             values.append({**figures, "unstylised_ssim": structural_similarity(stylised, coarse)})
             if art_fid is not None:
                 art_fid.add(stylised, coarse)

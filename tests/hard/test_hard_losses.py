@@ -2,11 +2,12 @@ import pytest
 import torch
 from hard.table import hard_case
 
+from sparsestyle_ns.core.feature_maps import feature_rows
 from sparsestyle_ns.losses.coarse import near_density, reconstruction_loss
 from sparsestyle_ns.losses.content import content_loss
 from sparsestyle_ns.losses.nnfm import nearest_neighbors, nnfm_loss
 from sparsestyle_ns.losses.style_index import StyleIndex
-from sparsestyle_ns.losses.stylization import StyleTargets, feature_rows, fit_side
+from sparsestyle_ns.losses.stylization import StyleTargets, fit_side
 from sparsestyle_ns.style.backbone import Backbone
 from sparsestyle_ns.style.backbones import load_backbone
 

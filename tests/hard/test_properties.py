@@ -27,7 +27,8 @@ import sparsestyle_ns.field_components
 import sparsestyle_ns.losses
 import sparsestyle_ns.rendering
 import sparsestyle_ns.style
-from sparsestyle_ns.core import ndc, precision, sampling, schedules
+from sparsestyle_ns.core import feature_maps as maps_of
+from sparsestyle_ns.core import ndc, precision, sampling, schedules, sliced
 from sparsestyle_ns.core import occupancy as density_grid
 from sparsestyle_ns.core import spaces as space
 from sparsestyle_ns.core import volrend as compositing
@@ -684,12 +685,26 @@ def test_pictures_are_read_as_they_were_written(tmp_path_factory, pixels):
     torch.testing.assert_close(read.pixels, expected.expand(3, -1, -1))
 
 
+@covers(sliced.random_directions, sliced.sliced_distance, sliced.quantiles)
+@given(st.data(), st.integers(1, 60), st.integers(1, 60), st.integers(1, 8), st.integers(1, 9))
+def test_distances_along_lines_are_finite_and_alike_both_ways(data, first, second, dimensions, lines):
+    clouds = [data.draw(tensors((count, dimensions), -6, 3, signed=True)) for count in (first, second)]
+    directions = sliced.random_directions(dimensions, lines, torch.Generator().manual_seed(0)).double()
+    clouds[0].requires_grad_()
+    distance = sliced.sliced_distance(*clouds, directions)
+    (gradient,) = torch.autograd.grad(distance, clouds[0])
+    assert distance >= 0 and distance.isfinite() and gradient.isfinite().all()
+    torch.testing.assert_close(sliced.sliced_distance(clouds[1], clouds[0], directions), distance)
+    spread = sliced.quantiles(clouds[1].sort(dim=0).values, first)
+    assert (spread.diff(dim=0) >= 0).all() and spread.min() >= clouds[1].min() and spread.max() <= clouds[1].max()
+
+
 @pytest.fixture(scope="module")
 def backbone():
     return backbones.load_backbone("vgg16-shift-tolerant")
 
 
-@covers(backbones.load_backbone, targets.fit_side, targets.feature_rows, targets.covered_rows, targets.sample_rows)
+@covers(backbones.load_backbone, targets.fit_side, maps_of.feature_rows, maps_of.covered_rows, targets.sample_rows)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(8, 24), st.floats(0, 1), SEEDS)
 def test_pictures_of_any_shape_have_features(backbone, height, width, side, contrast, seed):
     picture = contrast * torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(seed))
@@ -697,9 +712,9 @@ def test_pictures_of_any_shape_have_features(backbone, height, width, side, cont
     fitted = targets.fit_side(picture, side, backbone.smallest_side)
     assert max(fitted.shape[-2:]) == side and min(fitted.shape[-2:]) >= 8
     maps = backbone(fitted)
-    rows = targets.feature_rows(maps)
+    rows = maps_of.feature_rows(maps)
     accumulation = torch.rand(height, width, generator=torch.Generator().manual_seed(seed)) + contrast - 0.5
-    assert 1 <= len(targets.covered_rows(maps, accumulation)) <= len(rows) == len(targets.covered_rows(maps, None))
+    assert 1 <= len(maps_of.covered_rows(maps, accumulation)) <= len(rows) == len(maps_of.covered_rows(maps, None))
     kept = targets.sample_rows(rows, max(1, len(rows) // 2))
     assert len(kept) == max(1, len(rows) // 2) and targets.sample_rows(rows, len(rows)) is rows
     assert rows.shape[1] == backbone.channels and (rows >= 0).all() and rows.isfinite().all()

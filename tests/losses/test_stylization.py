@@ -1,9 +1,10 @@
 import torch
 from torch import nn
 
+from sparsestyle_ns.core.feature_maps import feature_rows
 from sparsestyle_ns.losses.content import content_loss
 from sparsestyle_ns.losses.nnfm import nnfm_loss
-from sparsestyle_ns.losses.stylization import StyleTargets, feature_rows, fit_side, sample_rows
+from sparsestyle_ns.losses.stylization import StyleTargets, fit_side, sample_rows
 
 
 class Patches(nn.Module):
