@@ -95,7 +95,7 @@ def report_tables(means: Dict[str, float], num_views: int) -> List[Table]:
     before = {key: means.get(f"{key}_before") for key in STYLE}
     rows = [("unstylised", before), ("stylised", means)]
     tables.append(table_of(f"Style, {views}", style, rows))
-    tables.append(table_of(f"Style and content, {views}", kept, [("stylised", means)], why_left_out(means)))
+    tables.append(table_of(f"Content, {views}", kept, [("stylised", means)], why_left_out(means)))
     if "short_rmse" in means:
         ceiling = {key[len("ceiling_") :]: value for key, value in means.items() if key.startswith("ceiling_")}
         columns = [*CONSISTENCY, *((f"{part}_visible", "visible", f"{part} ") for part in ("short", "long"))]

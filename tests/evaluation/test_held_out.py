@@ -83,10 +83,10 @@ def test_a_run_whose_painting_is_gone_is_measured_without_the_style_and_says_so(
 def test_the_tables_show_each_figure_and_say_what_is_missing(capsys: pytest.CaptureFixture) -> None:
     means = {"coarse_psnr": 20.5, "content_ssim": 0.5, "style_loss": 0.1, "style_loss_before": 0.2}
     means |= {"short_rmse": 0.04, "ceiling_short_rmse": 0.03, "short_visible": 0.9}
-    quality, style, consistency = report_tables(means, 3)
+    quality, style, content, consistency = report_tables(means, 3)
     assert (quality.columns, quality.rows) == (["PSNR dB ↑"], [("coarse", ["20.50"])])
-    assert style.rows == [("unstylised", ["0.2000", None]), ("stylised", ["0.1000", "0.500"])]
-    assert "ArtFID" in style.note
+    assert style.rows == [("unstylised", ["0.2000"]), ("stylised", ["0.1000"])]
+    assert content.rows == [("stylised", ["0.500"])] and "ArtFID" in content.note
     assert consistency.rows == [("stylised", ["0.040", "0.900"]), ("unstylised (the ceiling)", ["0.030", None])]
     consistency.print()
     assert "short RMSE ↓" in capsys.readouterr().out

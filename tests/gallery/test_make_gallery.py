@@ -132,7 +132,7 @@ def test_a_run_without_a_report_is_measured_when_that_is_asked_for_and_keeps_it(
     moved = tmp_path / "outputs" / "scene" / "hier-style" / "run"
     shutil.copytree(runs.style, moved)
     shown = collect_run(moved, num_views=1, frames=0, evaluate=True)
-    assert [table.title.split(",")[0] for table in shown.tables][:2] == ["Coarse field", "Style and content"]
+    assert [table.title.split(",")[0] for table in shown.tables][:3] == ["Coarse field", "Style", "Content"]
     kept = saved_report(moved, 2)
     assert len(kept.views) == 2
     assert json.loads((moved / "evaluation.json").read_text())["results"] == kept.means
@@ -144,7 +144,7 @@ def test_a_run_whose_folder_takes_no_report_is_measured_and_shown_all_the_same(r
     shutil.copytree(runs.style, moved)
     (moved / "evaluation.json").mkdir()
     shown = collect_run(moved, num_views=1, frames=0, evaluate=True)
-    assert [table.title.split(",")[0] for table in shown.tables][:2] == ["Coarse field", "Style and content"]
+    assert [table.title.split(",")[0] for table in shown.tables][:3] == ["Coarse field", "Style", "Content"]
     assert f"evaluation.json can't be saved in {moved} (Is a directory); its figures are" in capsys.readouterr().out
 
 

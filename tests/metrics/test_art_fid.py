@@ -198,7 +198,7 @@ def test_without_its_weights_it_is_left_out_and_the_files_are_named(
     assert ArtFID.against(torch.rand(3, 40, 50)) is None
     sentence = f"ArtFID is left out: it needs {ART_INCEPTION_FILE} and {ALEXNET_FILE} in {tmp_path / 'checkpoints'}."
     assert why_left_out({}) == sentence
-    assert report_tables({"coarse_psnr": 20.0, "style_loss": 0.1}, 3)[1].note == sentence
+    assert report_tables({"coarse_psnr": 20.0, "style_loss": 0.1}, 3)[2].note == sentence
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / ALEXNET_FILE).touch()
     assert missing_weights() == [ART_INCEPTION_FILE]
