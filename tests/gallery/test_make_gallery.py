@@ -195,7 +195,7 @@ def test_photos_that_look_one_way_give_a_flight_through_them_there_and_back():
     assert (places[4] - given[1]).norm() < 0.05
     steps = places.diff(dim=0).norm(dim=-1)
     assert steps[0] < 0.5 * steps[3]  # slow where it turns
-    assert len(measuring_path(cameras)) == 25  # which the showing path has nothing to do with
+    assert len(measuring_path(cameras)) == 17  # which the showing path has nothing to do with
 
 
 def test_one_photo_gives_no_film():
