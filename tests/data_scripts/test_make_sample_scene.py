@@ -9,7 +9,9 @@ import cv2
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+import torch
 from make_sample_scene import main
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from sample_scene.cameras import circling_cameras, forward_facing_cameras, look_at, rays_of_rows, surrounding_cameras
 from sample_scene.scene import Scene, objects_on_a_plinth, still_life
 from sample_scene.shapes import Box, Sphere
@@ -281,9 +283,7 @@ def test_transforms_have_the_layout_of_nerfs_synthetic_scenes(blender):
 
 
 def test_nerfstudios_blender_dataparser_reads_cameras_that_see_the_pictures(blender):
-    torch = pytest.importorskip("torch")
-    parsers = pytest.importorskip("nerfstudio.data.dataparsers.blender_dataparser")
-    parsed = parsers.BlenderDataParserConfig(data=blender).setup().get_dataparser_outputs("train")
+    parsed = BlenderDataParserConfig(data=blender).setup().get_dataparser_outputs("train")
     assert len(parsed.image_filenames) == 3
     for i, path in enumerate(parsed.image_filenames):
         rays = parsed.cameras.generate_rays(i, coords=torch.tensor([[20.0, 20.0]]))

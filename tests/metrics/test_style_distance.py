@@ -1,5 +1,7 @@
 """Distances of pictures to a painting that nobody trains on."""
 
+import math
+
 import pytest
 import torch
 
@@ -56,3 +58,10 @@ def test_only_what_covers_the_picture_counts(painting):
 def test_without_weights_textures_are_left_out(painting, monkeypatch):
     monkeypatch.setattr("sparsestyle_ns.metrics.style_distance.st_lpips_metric", lambda size: None)
     assert set(StyleDistance(painting).figures(painting.permute(1, 2, 0))) == {"color_distance", "colors_used"}
+
+
+def test_paintings_of_one_color_and_tiny_pictures_have_figures(painting):
+    plain = StyleDistance(torch.full((3, 64, 80), 0.5)).figures(painting.permute(1, 2, 0))
+    assert all(math.isfinite(value) for value in plain.values()) and plain["texture_distance"] > 0
+    tiny = StyleDistance(painting).figures(torch.rand(20, 80, 3))
+    assert set(tiny) == {"color_distance", "colors_used"}

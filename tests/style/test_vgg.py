@@ -111,7 +111,8 @@ def block_3(features, last, images):
 
 
 def test_the_plain_network_is_torchvisions(plain_file, images):
-    models = pytest.importorskip("torchvision.models.vgg")
+    from torchvision.models import vgg as models
+
     peer = models.make_layers(models.cfgs["D"])
     state = {key.removeprefix("features."): value for key, value in torch.load(plain_file).items()}
     peer[:16].load_state_dict(state)
@@ -121,7 +122,8 @@ def test_the_plain_network_is_torchvisions(plain_file, images):
 
 
 def test_the_shift_tolerant_network_is_that_of_its_own_package(images):
-    trunk = pytest.importorskip("stlpips_pytorch.models_lpf.vgg")
+    from stlpips_pytorch.models_lpf import vgg as trunk
+
     path = Path(trunk.__file__).parents[1] / "weights" / "vST0.0" / "vgg_shift_tolerant.pth"
     peer = trunk.make_layers(trunk.cfg["D"], filter_size=3, pad_more=True)
     state = torch.load(path, map_location="cpu")
@@ -265,7 +267,6 @@ def test_the_shift_tolerant_network_is_taken_on_request_without_asking_the_netwo
 
 
 def test_no_code_of_the_package_is_run():
-    pytest.importorskip("stlpips_pytorch")
     program = (
         "import sys; from sparsestyle_ns.style.backbones import load_backbone; "
         "assert 'torchvision' not in sys.modules; load_backbone('vgg16-shift-tolerant'); "
