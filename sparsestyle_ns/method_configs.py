@@ -12,6 +12,7 @@ from sparsestyle_ns.effects.decisions import EffectSettings
 from sparsestyle_ns.engine.style_trainer import HierStyleTrainerConfig
 from sparsestyle_ns.engine.trainer import CoarseFewShotTrainer, SparseStyleTrainerConfig
 from sparsestyle_ns.engine.training import FusedAdamConfig, MuonConfig, WarmUpSchedulerConfig
+from sparsestyle_ns.losses.stylization import LOSSES
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
@@ -67,7 +68,7 @@ def variant(of: MethodSpecification, suffix: str, description: str, settings: Di
     return MethodSpecification(config, description)
 
 
-COARSE_ITERATIONS, STYLE_ITERATIONS = 3000, 120
+COARSE_ITERATIONS, STYLE_ITERATIONS = 3000, 200
 coarse_fewshot = method(
     SparseStyleTrainerConfig,
     "Coarse radiance field from three to eight photos (stage 1): under four minutes on two CPU cores at 504 pixels.",
@@ -124,8 +125,7 @@ hier_style_draft = variant(
         "coarse_method": coarse_fewshot_draft_config,
         "max_num_iterations": 80,
         "optimizers": style_optimizers([40, 64]),
-        # Half of the paper's, as the images are: cells finer than pixels don't reach new views.
-        "pipeline.model.min_resolution": 64,
+        # Half of the default, as the images are: cells finer than pixels don't reach new views.
         "pipeline.model.max_resolution": 256,
     },
 )
@@ -162,6 +162,8 @@ hier_style_paper = variant(
         "pipeline.view_scales": (1.0,),
         "pipeline.scale_shares": (1.0,),
         "pipeline.content_share": 0.5,
+        "pipeline.loss_weights": {**dict.fromkeys(LOSSES, 0.0), "content": 10.0, "style": 1.0},
+        "pipeline.model.min_resolution": 128,
         "pipeline.warm_start_steps": 0,
         "pipeline.thinning": 0.0,
         "optimizers": {"fields": adam(5e-3, MultiStepSchedulerConfig(gamma=0.33, milestones=(50, 100)))},

@@ -19,7 +19,7 @@ from sparsestyle_ns.data.scene_info import SCENE_INFO, SceneInfo, scene_info
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.evaluation.held_out import StyleFigures
-from sparsestyle_ns.losses.stylization import LOSSES
+from sparsestyle_ns.losses.stylization import LOSSES, default_weights
 from sparsestyle_ns.losses.stylization_loss import PaintingFeatures, StylizationLoss, StylizedView
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
@@ -122,14 +122,14 @@ def training_of(runs: SimpleNamespace, **settings: object) -> Training:
 def test_a_new_loss_is_trained_measured_and_has_a_flag(runs: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(LOSSES, "brightness", BrightnessLoss)
     given = tyro.cli(Settings, args=["--pipeline.loss-weights.brightness", "0.5"]).pipeline
-    assert given.loss_weights == {"content": 10.0, "style": 1.0, "brightness": 0.5}
+    assert given.loss_weights == {**default_weights(), "brightness": 0.5}
 
     training = training_of(runs, loss_weights=given.loss_weights)
     pipeline = training.pipeline
     told = []
     pipeline.on_losses = lambda step, losses: told.append(losses)
     training.step()
-    assert told[0].terms().keys() == {"content_loss", "style_loss", "brightness_loss"}
+    assert told[0].terms().keys() == {f"{name}_loss" for name in LOSSES}
     assert told[0].terms()["brightness_loss"] == 0.5 * told[0].values["brightness"]
     assert "brightness" in told[0].metrics()
 

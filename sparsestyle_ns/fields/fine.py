@@ -57,8 +57,8 @@ class FineFieldConfig:
     """Octaves of the sines and cosines, where they take the hash grid's place."""
     hash_levels: int = 8
     """Levels of the hash grid (M)."""
-    min_resolution: int = 128
-    """Cells along the cube's side on the first level (N_min)."""
+    min_resolution: int = 16
+    """Cells along the cube's side on the first level (N_min). The paper's is 128; with coarser cells strokes are wider, and the finest don't show as grain."""
     max_resolution: int = 512
     """Cells along the cube's side on the last level (N_max)."""
     features_per_level: int = 4

@@ -10,9 +10,9 @@ from sparsestyle_ns.losses.stylization_loss import StylizationLoss, StylizedView
 
 
 class ContentLoss(StylizationLoss):
-    """L_content of Eq. 5; its weight is λ0 (Eq. 6)."""
+    """L_content of Eq. 5; its weight is λ0 (Eq. 6). The paper's is 10, for a loss in other units."""
 
-    weight = 10.0
+    weight = 0.1
 
     def __call__(self, view: StylizedView) -> Float[Tensor, ""]:
         """See `content_loss`."""

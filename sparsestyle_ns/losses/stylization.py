@@ -11,10 +11,16 @@ from torch import Tensor
 from sparsestyle_ns.core.feature_maps import covered_rows, feature_rows
 from sparsestyle_ns.losses.content import ContentLoss
 from sparsestyle_ns.losses.nnfm import NNFMLoss
+from sparsestyle_ns.losses.sliced import ColorLoss, TextureLoss
 from sparsestyle_ns.losses.stylization_loss import PaintingFeatures, StylizationLoss, StylizedView
 from sparsestyle_ns.style.backbone import Backbone
 
-LOSSES: Dict[str, Type[StylizationLoss]] = {"content": ContentLoss, "style": NNFMLoss}
+LOSSES: Dict[str, Type[StylizationLoss]] = {
+    "content": ContentLoss,
+    "style": NNFMLoss,
+    "colors": ColorLoss,
+    "textures": TextureLoss,
+}
 """A new one is a file with a `StylizationLoss`, and its entry here."""
 
 
@@ -106,10 +112,11 @@ class StyleTargets:
         image: Float[Tensor, "H W 3"],
         content: Float[Tensor, "1 C h w"],
         accumulation: Optional[Float[Tensor, "H W"]] = None,
+        step: int = 0,
     ) -> StylizedView:
         """A rendered picture in [0, 1], ready for the losses; features count where the accumulation is above half."""
-        features, target = (covered_rows(maps, accumulation) for maps in (self.features(image), content))
-        return StylizedView(image, features, target)
+        maps = self.features(image), content, image.permute(2, 0, 1)[None]
+        return StylizedView(image, *(covered_rows(each, accumulation) for each in maps), step)
 
     def losses(self, view: StylizedView) -> Dict[str, Float[Tensor, ""]]:
         """The losses of a view, by name, not weighted."""

@@ -25,6 +25,10 @@ class StylizedView:
     """Of the picture, where the scene covers it; differentiable."""
     content: Float[Tensor, "rows C"]
     """Those of the content picture."""
+    colors: Float[Tensor, "pixels 3"]
+    """Of the picture, where the scene covers it; differentiable."""
+    step: int = 0
+    """The iteration, for what a loss draws at random."""
 
 
 class StylizationLoss(ABC):

@@ -42,7 +42,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     view_scales: Tuple[float, ...] = (0.5, 1.0)
     """Sizes at which the views are stylised, one after another, as shares of the photos'; the last is the one that
     counts, and iterations before it are quick."""
-    scale_shares: Tuple[float, ...] = (0.65, 0.35)
+    scale_shares: Tuple[float, ...] = (0.85, 0.15)
     """Shares of the iterations at these sizes."""
     feature_side: Optional[int] = None
     """Longer side, in pixels, at which the feature network sees rendered views of the photos' size. None: theirs."""
@@ -216,7 +216,7 @@ class HierStylePipeline(CheckedPipeline):
             generator = torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + step)
             task.style.thinning = Thinning(self.config.thinning, generator)
         image = self.scene_views.render(view, task.style)
-        values = targets.losses(targets.view(image, view.features, view.accumulation))
+        values = targets.losses(targets.view(image, view.features, view.accumulation, step))
         return image, Losses(values, self.config.weights_at(step, schedule))
 
     def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Tensor], Dict[str, Tensor], Dict[str, Any]]:

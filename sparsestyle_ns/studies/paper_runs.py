@@ -23,9 +23,14 @@ COLORS_ALONE: Settings = {"pipeline.effects.view_color": "on", "pipeline.effects
 """What both stages have to be told of every kind of stage 1 but ours."""
 CONSTANT: Settings = {"pipeline.content_decay": 1.0, "pipeline.content_restart": 1.0}
 """The content weight stays as it is in all iterations, at each size of the views."""
+PAPER_LOSSES: Settings = {"pipeline.loss_weights.colors": 0.0, "pipeline.loss_weights.textures": 0.0}
+"""Content and style alone, as ARF and the paper have it."""
+CONTENT_WEIGHTS = (0.1, 0.01, 0.001)
+"""What ours begins with, ends with, and the middle between."""
 FINE_TUNING: Settings = {
     "pipeline.model.stylised_field": "coarse",
     "optimizers.fields.optimizer.lr": 5e-4,
+    **PAPER_LOSSES,
     "pipeline.loss_weights.content": 0.1,
     **CONSTANT,
     # Every step counts as a sample, and of those that show all activations are kept: about 10 KB each.
@@ -37,7 +42,7 @@ STYLE_KINDS: Dict[str, Settings] = {
     "ec-only": {"pipeline.model.fine_encoding": "none"},
     "frequency": {"pipeline.model.fine_encoding": "frequency"},
     "coarse-density": {"pipeline.effects.residual_density": "off"},
-    **{f"lambda-{weight:g}": {"pipeline.loss_weights.content": weight, **CONSTANT} for weight in (10.0, 1.0, 0.1)},
+    **{f"lambda-{weight:g}": {"pipeline.loss_weights.content": weight, **CONSTANT} for weight in CONTENT_WEIGHTS},
 }
 """Stage 2: as it is; the coarse field itself fine-tuned, as ARF does, at stage 1's learning rate and with the content
 weight that ours ends with; and the paper's ablations."""

@@ -107,7 +107,7 @@ OF_STAGE_2 = (
         "Content annealing (Fig. 8)",
         "The content weight falling from 10 to 0.1, and constant ones. Pictures are a held-out photo, the unstylised "
         "view, and the stylised one.",
-        {"ours": OURS, **{f"λ = {weight}": (f"lambda-{weight}", "ours") for weight in ("10", "1", "0.1")}},
+        {"ours": OURS, **{f"λ = {weight}": (f"lambda-{weight}", "ours") for weight in ("0.1", "0.01", "0.001")}},
         with_training=True,
     ),
 )
