@@ -125,8 +125,6 @@ hier_style_draft = variant(
         "coarse_method": coarse_fewshot_draft_config,
         "max_num_iterations": 80,
         "optimizers": style_optimizers([40, 64]),
-        # Half of the default, as the images are: cells finer than pixels don't reach new views.
-        "pipeline.model.max_resolution": 256,
     },
 )
 
@@ -164,6 +162,7 @@ hier_style_paper = variant(
         "pipeline.content_share": 0.5,
         "pipeline.loss_weights": {**dict.fromkeys(LOSSES, 0.0), "content": 10.0, "style": 1.0},
         "pipeline.model.min_resolution": 128,
+        "pipeline.model.max_resolution": 512,
         "pipeline.warm_start_steps": 0,
         "pipeline.thinning": 0.0,
         "optimizers": {"fields": adam(5e-3, MultiStepSchedulerConfig(gamma=0.33, milestones=(50, 100)))},

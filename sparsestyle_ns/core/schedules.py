@@ -47,7 +47,8 @@ class Level:
 def coarse_to_fine(scales: Sequence[float], shares: Sequence[float], total: int) -> Tuple[Level, ...]:
     """Divides `total` iterations among sizes, ascending scales in (0, 1], by shares above 0 whose sum needn't be 1.
 
-    Sizes that would get no iteration are left out, but for the last. InputError where scales or shares aren't such.
+    The last gets one at least, where there is any; others that would get none are left out. InputError where scales or
+    shares aren't such.
     """
     ascending = all(scale < larger for scale, larger in pairwise(scales))
     if not (scales and len(scales) == len(shares) and ascending and all(0.0 < scale <= 1.0 for scale in scales)):
@@ -60,6 +61,7 @@ def coarse_to_fine(scales: Sequence[float], shares: Sequence[float], total: int)
     borders = [0]
     for place in range(len(scales)):
         borders.append(round(total * sum(shares[: place + 1]) / sum(shares)))
+    borders[:-1] = [min(border, max(0, total - 1)) for border in borders[:-1]]
     levels = [
         Level(scale, first, after - first) for scale, first, after in zip(scales, borders, borders[1:], strict=False)
     ]

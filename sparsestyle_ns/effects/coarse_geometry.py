@@ -23,8 +23,8 @@ MAX_MIST = 0.2
 """Optical depth that such points may have all along the cube's side. Many cells that are nearly empty can together hide
 what is behind them; drafts of fern and lego have 0.05 and 0.01."""
 MIN_HAZE = 0.5
-"""Share of haze, in what isn't empty, from which on the coarse geometry isn't trusted. Surfaces are hazy at their edges:
-fern has 0.12 and lego 0.42, and both are stylised as well without residual density."""
+"""Share of haze, in what isn't empty, from which on the coarse geometry isn't trusted. Surfaces have hazy
+edges: fern has 0.12 and lego 0.42, and both are stylised as well without residual density."""
 NUM_POINTS = 1 << 14
 """Points, always the same, at which the density is looked up."""
 

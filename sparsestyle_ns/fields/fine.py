@@ -58,9 +58,10 @@ class FineFieldConfig:
     hash_levels: int = 8
     """Levels of the hash grid (M)."""
     min_resolution: int = 16
-    """Cells along the cube's side on the first level (N_min). The paper's is 128; with coarser cells strokes are wider, and the finest don't show as grain."""
-    max_resolution: int = 512
-    """Cells along the cube's side on the last level (N_max)."""
+    """Cells along the cube's side on the first level (N_min). The paper's is 128; coarser ones make wider strokes."""
+    max_resolution: int = 256
+    """Cells along the cube's side on the last level (N_max). The paper's is 512; in cells as fine as pixels
+    new views see grain."""
     features_per_level: int = 4
     """Features of a cell's corner."""
     log2_table_size: int = 19

@@ -39,8 +39,10 @@ class HierStyleModelConfig(FineFieldConfig, SceneModelConfig):
     num_steps: int = 128
     """Even steps along a ray, on which the frozen coarse field is looked at; those in empty cells are skipped."""
     num_samples: Optional[int] = 4
-    """Samples a ray on which the stylised field is looked at, where the coarse field's weight is; None: every step
-    that can show, as with a fine-tuned copy of the coarse field, whose weight moves."""
+    """Samples a ray on which the stylised field learns, where the coarse field's weight is; None: every step that can
+    show, as with a fine-tuned copy of the coarse field, whose weight moves."""
+    num_eval_samples: Optional[int] = 5
+    """The same in pictures; more of them show fewer ripples where colour changes along rays."""
     even_share: float = 0.2
     """Where residual density may add to the geometry, this share of all samples, in [0, 1), lies evenly besides."""
     occupancy_resolution: int = 128
@@ -84,8 +86,10 @@ class HierStyleModel(SceneModel):
             if not 0.0 <= (value := getattr(config, name)) <= 1.0:
                 flag = name.replace("_", "-")
                 raise InputError(f"--pipeline.model.{flag} is {value}; give a number from 0 to 1.")
-        if config.num_samples is not None and config.num_samples < 1:
-            raise InputError(f"--pipeline.model.num-samples is {config.num_samples}; give 1 or more, or None.")
+        for name in ("num_samples", "num_eval_samples"):
+            if (count := getattr(config, name)) is not None and count < 1:
+                flag = name.replace("_", "-")
+                raise InputError(f"--pipeline.model.{flag} is {count}; give 1 or more, or None.")
         if not 0.0 <= config.even_share < 1.0:
             raise InputError(f"--pipeline.model.even-share is {config.even_share}; give a number from 0 to below 1.")
         self.display = Display(Look(config.render_mode, Mix(config.strength, config.geometry_strength)))
@@ -104,13 +108,21 @@ class HierStyleModel(SceneModel):
 
     @property
     def marching(self) -> Marching:
-        """Where the samples of the frozen coarse field lie."""
+        """Where the samples of the frozen coarse field lie in pictures."""
+        return self._marching(self.config.num_eval_samples)
+
+    @property
+    def learning(self) -> Marching:
+        """Where they lie in the views that are stylised."""
+        return self._marching(self.config.num_samples)
+
+    def _marching(self, num_samples: Optional[int]) -> Marching:
         config = self.config
         few = None
-        if config.num_samples is not None and config.stylised_field == "residual":
+        if num_samples is not None and config.stylised_field == "residual":
             even_share = config.even_share if self.effects.on("residual_density") else 0.0
             # The even ones come on top of those where the weight is.
-            few = FewSamples(self.volume, math.ceil(config.num_samples / (1.0 - even_share)), even_share)
+            few = FewSamples(self.volume, math.ceil(num_samples / (1.0 - even_share)), even_share)
         return Marching(self.occupancy, config.num_steps, self.space.unbounded, config.min_transmittance, few)
 
     def get_param_groups(self) -> Dict[str, List[Parameter]]:
@@ -139,11 +151,14 @@ class HierStyleModel(SceneModel):
         if self.occupancy is not None:
             self.occupancy.measure(self.volume, self.config.min_alpha)
 
-    def freeze(self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]) -> FrozenSamples:
-        """`freeze_samples` of rays for this model's own style."""
+    def freeze(
+        self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], marching: Optional[Marching] = None
+    ) -> FrozenSamples:
+        """`freeze_samples` of rays for this model's own style, by default those on which it learns."""
+        marching = marching or self.learning
         with autocast(self.device, self.config.precision):
             frozen = [
-                render.freeze_samples(self.field, self.residual, self.space.segments(*part), self.marching)
+                render.freeze_samples(self.field, self.residual, self.space.segments(*part), marching)
                 for part in zip(origins.split(RAYS_PER_CALL), directions.split(RAYS_PER_CALL), strict=True)
             ]
             return FrozenSamples.joined(frozen, self.residual)
@@ -156,7 +171,7 @@ class HierStyleModel(SceneModel):
         keep_bytes: float,
     ) -> FrozenView:
         """A view for whole-image steps, in chunks of at most `samples_per_chunk` samples (see `FrozenView`)."""
-        runs = equal_runs(len(origins), samples_per_chunk // self.marching.most_samples)
+        runs = equal_runs(len(origins), samples_per_chunk // self.learning.most_samples)
         return FrozenView(runs, lambda run: self.freeze(origins[run], directions[run]), keep_bytes)
 
     def stylised(
@@ -180,7 +195,8 @@ class HierStyleModel(SceneModel):
         if look.mode == "baked" and not self.training:
             fine, coarse = self.baked.render(styles, segments, self.marching, self.background, look.mix)
         else:
-            frozen, directions = self.freeze(ray_bundle.origins, ray_bundle.directions), ray_bundle.directions
+            origins, directions = ray_bundle.origins, ray_bundle.directions
+            frozen = self.freeze(origins, directions, self.marching)
             with autocast(self.device, self.config.precision):
                 fine, coarse = render.render_mixed(self.field, styles, frozen, directions, self.background, look.mix)
         return {

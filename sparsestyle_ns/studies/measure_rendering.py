@@ -117,7 +117,7 @@ def quadrature_plans(bench: Workbench) -> List[Plan]:
     ]
     title = "Samples a ray of the stylised field"
     stylised = {
-        on: curve(bench.style_config, "num_samples", f"stylised samples, {words}", f"{title}, {words}")
+        on: curve(bench.style_config, "num_eval_samples", f"stylised samples, {words}", f"{title}, {words}")
         for on, words in ((False, "no residual density"), (True, "residual density"))
     }
     return [
@@ -148,12 +148,12 @@ def _measure_marching(bench: Workbench, steps: Curve, skipping: Curve, stopping:
 
     @contextlib.contextmanager
     def at_every_step(change: Change) -> Iterator[None]:
-        with altered(config, num_samples=None), change():
+        with altered(config, num_eval_samples=None), change():
             yield
 
     def exact(rays: RayBundle) -> Colors:
         everywhere = Occupancy(1).to(model.device)
-        finest = altered(config, num_samples=None, num_steps=converged, min_transmittance=0.0)
+        finest = altered(config, num_eval_samples=None, num_steps=converged, min_transmittance=0.0)
         with finest, altered(model, occupancy=everywhere):
             return model.get_outputs(rays)["rgb_coarse"]
 
@@ -176,9 +176,9 @@ def _measure_stylised_samples(bench: Workbench, curves: Mapping[bool, Curve], bu
     """Both curves, without residual density and with it, where the field has any; with a render of their own each."""
     model = bench.model_to_render()
     config, output = model.config, "rgb" if bench.is_stylised else "rgb_coarse"
-    preset = config.num_samples or config.num_steps
+    preset = config.num_eval_samples or config.num_steps
     converged = CONVERGED * max(multiples(preset))
-    finest = {"num_samples": converged, "num_steps": CONVERGED * config.num_steps}
+    finest = {"num_eval_samples": converged, "num_steps": CONVERGED * config.num_steps}
 
     def draw(rays: RayBundle) -> Colors:
         return model.get_outputs(rays)[output]
@@ -195,7 +195,7 @@ def _measure_stylised_samples(bench: Workbench, curves: Mapping[bool, Curve], bu
     for number, on in enumerate(ways):
         effects = model.effects.replaced(dataclasses.replace(decision, on=on))
         flat = dataclasses.replace(look, mix=look.mix._replace(geometry=look.mix.geometry if on else 0.0))
-        changes = _settings(config, "num_samples", multiples(preset))
+        changes = _settings(config, "num_eval_samples", multiples(preset))
         with altered(model, effects=effects), altered(model.display, own=flat):
             part = budget.part(budget.left / (len(ways) - number))
             _sweep(bench, draw, {curves[on]: changes}, reference, part)

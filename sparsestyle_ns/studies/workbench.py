@@ -206,7 +206,7 @@ class Workbench:
         accumulation = None if model.background is None else outputs["accumulation"].squeeze(-1)
         content = self.targets.features(outputs["rgb_coarse"])
         losses = self.targets.losses(self.targets.view(outputs["rgb"], content, accumulation))
-        return {f"{name}_loss": float(value) for name, value in losses.items()}
+        return {f"{name}_loss": float(losses[name]) for name in ("style", "content")}
 
     def keep_coarse(self, model: CoarseFewShotModel) -> None:
         """Makes a coarse model the one that all other curves build on."""

@@ -68,9 +68,10 @@ def test_shares_neednt_sum_up_to_1():
     assert coarse_to_fine((0.5, 1.0), (3, 2), 150) == coarse_to_fine((0.5, 1.0), (0.6, 0.4), 150)
 
 
-def test_a_size_that_gets_no_iteration_is_left_out_but_the_last_stays():
+def test_a_size_that_gets_no_iteration_is_left_out_and_the_last_gets_one():
     assert coarse_to_fine((0.25, 0.5, 1.0), (0.1, 0.1, 9.8), 4) == (Level(1.0, 0, 4),)
-    assert coarse_to_fine((0.5, 1.0), (0.6, 0.4), 1) == (Level(0.5, 0, 1), Level(1.0, 1, 0))
+    assert coarse_to_fine((0.5, 1.0), (0.6, 0.4), 1) == (Level(1.0, 0, 1),)
+    assert coarse_to_fine((0.5, 1.0), (0.9, 0.1), 3) == (Level(0.5, 0, 2), Level(1.0, 2, 1))
     assert coarse_to_fine((0.5, 1.0), (0.6, 0.4), 0) == (Level(1.0, 0, 0),)
 
 

@@ -144,14 +144,23 @@ def test_an_effect_that_a_scene_calls_for_makes_held_out_views_better(scenes, la
     assert with_it > without
 
 
-@pytest.mark.parametrize("options, is_on", [((), True), (("--haze", "1"), False)], ids=["clear", "thick mist"])
-def test_the_coarse_field_of_a_made_scene_calls_for_skipping_and_residual_density_or_not(scenes, options, is_on):
-    pipeline = trained_coarse(scenes("llff", *options), "llff", 300, {})
-    # In a thick mist all photos are grey: what is learned is solid all over, nothing to skip and nothing doubtful.
+@pytest.mark.parametrize(
+    "layout, options, steps, has_empty_space, is_haze",
+    [
+        pytest.param("llff", (), 300, True, False, id="clear"),
+        # All photos are grey: what is learned is solid all over, nothing to skip and nothing doubtful.
+        pytest.param("llff", ("--haze", "1"), 300, False, False, id="thick mist"),
+        pytest.param("blender", (), 60, False, True, id="hardly trained"),
+    ],
+)
+def test_the_coarse_field_of_a_made_scene_calls_for_skipping_and_residual_density_or_not(
+    scenes, layout, options, steps, has_empty_space, is_haze
+):
+    pipeline = trained_coarse(scenes(layout, *options), layout, steps, {})
     field = pipeline.model.field
     scene = replace(pipeline.datamanager.scene, coarse_density=lambda points: field.density_and_feature(points)[0])
     decisions = decide(scene, EffectSettings())
-    assert decisions.on("empty_space") is decisions.on("residual_density") is is_on
+    assert (decisions.on("empty_space"), decisions.on("residual_density")) == (has_empty_space, is_haze)
     assert decisions["empty_space"].measured is not None
 
 

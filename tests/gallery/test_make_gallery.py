@@ -61,7 +61,7 @@ def test_collect_run_shows_photos_and_held_out_views_wherever_the_run_is_now(run
             assert pixels.dtype == np.uint8
     assert dict(run.settings)["Iterations"] == "3 of 3"
     assert dict(run.settings)["Size it sees views at"] == "24 pixels in 2 iterations, then 48 pixels in 1 iterations"
-    assert dict(run.settings)["Content weight λ"] == "10 to 0.1 in 1 iterations, then 3 to 0.1 in 1 iterations"
+    assert dict(run.settings)["Content weight λ"] == "0.1 to 0.001 in 1 iterations, then 0.03 to 0.001 in 1 iterations"
     assert run.subtitle == "hier-style, 3 photos, 3 iterations"
     assert run.style_name == "painting"
     assert [table.title for table in run.tables] == ["Mean of the views above, 2"]

@@ -112,7 +112,7 @@ def test_the_volume_stays_while_the_weights_do(model):
 @pytest.mark.parametrize("fused", [True, False])
 def test_a_training_step_is_seen_in_the_next_picture(fused):
     # So large a step makes new surfaces, of which a few samples a ray would show less than the baked picture.
-    model = make_model(render_mode="baked", num_samples=None)
+    model = make_model(render_mode="baked", num_samples=None, num_eval_samples=None)
     before = render(model)
     model.train()
     parameters = model.get_param_groups()["fields"]
@@ -137,10 +137,10 @@ def test_a_loaded_checkpoint_is_seen_in_the_next_picture(model, assign):
     assert_close(after, render(model, "exact"))
 
 
-def test_another_coarse_field_is_seen_in_the_next_picture(model):
+def test_another_coarse_field_is_seen_in_the_next_picture():
+    model, other = make_model(render_mode="baked", num_eval_samples=None), make_model()
     render(model)
     first = volume(model)
-    other = make_model()
     torch.nn.init.constant_(other.field.density_head.bias, 2.0)
     model.adopt_coarse(other.state_dict())
     found = render(model)
@@ -305,3 +305,16 @@ def test_a_new_style_is_no_part_of_the_model_and_starts_on_the_coarse_geometry(m
     found = shown(model, "exact", model.new_style())
     assert set(model.state_dict()) == names
     assert torch.equal(found["depth"], found["depth_coarse"])
+
+
+def test_pictures_have_samples_of_their_own_and_views_that_are_learned_from_others():
+    model = make_model(num_samples=2, num_eval_samples=9, even_share=0.0)
+    assert (model.learning.few.count, model.marching.few.count) == (2, 9)
+    model = make_model(num_samples=None, num_eval_samples=8, even_share=0.5)
+    assert model.learning.few is None and model.marching.few.count == 16
+
+
+@pytest.mark.parametrize("name", ["num_samples", "num_eval_samples"])
+def test_no_samples_at_all_are_refused(name):
+    with pytest.raises(InputError, match=f"--pipeline.model.{name.replace('_', '-')} is 0; give 1 or more"):
+        make_model(**{name: 0})

@@ -44,7 +44,12 @@ def content_weights(iterations, **settings):
 
 def test_the_content_losses_weight_falls_at_each_size_and_ends_at_one_value():
     first, second, third = content_weights(
-        1000, view_scales=(0.25, 0.5, 1.0), scale_shares=(0.5, 0.3, 0.2), content_share=0.6, content_restart=0.3
+        1000,
+        view_scales=(0.25, 0.5, 1.0),
+        scale_shares=(0.5, 0.3, 0.2),
+        content_share=0.6,
+        content_restart=0.3,
+        loss_weights={"content": 10.0},
     )
     assert first[0] == pytest.approx(10.0) and second[0] == third[0] == pytest.approx(3.0)
     for weights in (first, second, third):
@@ -56,7 +61,9 @@ def test_the_content_losses_weight_falls_at_each_size_and_ends_at_one_value():
 
 
 def test_at_one_size_it_is_equation_6():
-    (weights,) = content_weights(200, view_scales=(1.0,), scale_shares=(1.0,), content_share=0.5)
+    (weights,) = content_weights(
+        200, view_scales=(1.0,), scale_shares=(1.0,), content_share=0.5, loss_weights={"content": 10.0}
+    )
     assert weights[:101] == pytest.approx([10 * 0.01 ** (step / 100) for step in range(101)])
     assert weights[100:] == pytest.approx([0.1] * 100)
 
