@@ -24,12 +24,14 @@ from torch import Tensor
 
 from benchmarks._measure import Report, timed
 from benchmarks._scene import find_scene
-from benchmarks.render import SIDE, RenderOptions, stylise
+from benchmarks.render import RenderOptions, stylise
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
 from sparsestyle_ns.utils.errors import exit_on_input_error
 from sparsestyle_ns.viewer.panel import NO_BLEND
 from sparsestyle_ns.viewer.styles import Style
 
+SIDE = 504
+"""Of the pictures; the scene that is looked at is trained at the size of `benchmarks.render`."""
 FRAMES = 8
 
 

@@ -27,6 +27,8 @@ from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.numba_kernels import untraced
 from sparsestyle_ns.utils.progress import bar
 
+BAKED_RAYS = 1 << 16
+"""Rays of a baked picture that are marched at once; a viewer can break it off in between."""
 RAYS_PER_CALL = 1 << 13
 """Rays that are marched at once; bounds the memory of the steps in empty space."""
 
@@ -207,6 +209,15 @@ class HierStyleModel(SceneModel):
             "accumulation_coarse": coarse.accumulation,
             "depth_coarse": surface_distance(segments, coarse.s),
         }
+
+    @torch.no_grad()
+    def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> Dict[str, Tensor]:
+        """`get_outputs` of a picture, [H, W, channels] each; a baked one takes more rays at once than an exact one."""
+        if self.display.look.mode != "baked" or self.training:
+            return super().get_outputs_for_camera_ray_bundle(camera_ray_bundle)
+        rays = camera_ray_bundle.to(self.device).flatten()
+        parts = [self(rays[start : start + BAKED_RAYS]) for start in range(0, len(rays), BAKED_RAYS)]
+        return {name: torch.cat([part[name] for part in parts]).view(*camera_ray_bundle.shape, -1) for name in parts[0]}
 
     def get_rgba_image(self, outputs: Dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Colour without background, and the stylised geometry's opacity, for `ns-export tsdf` and ns-render's rgba."""

@@ -17,6 +17,8 @@ _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _SHADE = np.float32(1.0 / 255.0)
 _DEPTH_CAP = np.float32(MAX_OPTICAL_DEPTH)
 _UNSEEN = np.float32(2e-4)  # of a ray's weight: with less, a sample has no colour, only opacity
+_TINY, _ENDLESS = np.float32(1e-12), np.float32(np.inf)
+_CAREFUL = np.float32(2 * 0.999)  # the cube's side, but for rounding
 _LEAST_DISPARITY = np.float32(0.5 / MAX_DISTANCE)
 _BYTE, _NO_BYTE = np.uint64(255), np.uint64(0)
 _BITS_8, _BITS_16, _BITS_24, _BITS_32, _BITS_40, _BITS_48, _BITS_56 = (np.uint64(8 * byte) for byte in range(1, 8))
@@ -42,7 +44,9 @@ class Lines(NamedTuple):
 class Voxels(NamedTuple):
     """What rays go through: see `Occupancy` and `BakedVolume`, and `DENSITY_UNIT` and what follows it there."""
 
-    occupied: np.ndarray
+    clearance: np.ndarray
+    """Of each cell of the occupancy's: how many cells away the nearest occupied one is, along the axis on which it is
+    farthest; 0 of an occupied cell."""
     slots: np.ndarray
     words: np.ndarray
     """The eight codes of a voxel, the first in the lowest byte, by slot and place in the brick."""
@@ -83,10 +87,15 @@ def _scaled(coordinate, size):
 
 
 @kernel
-def _is_occupied(occupied, x, y, z):
-    size = occupied.shape[0]
+def _empty_steps(clearance, x, y, z, length):
+    """How many steps of a length, from this point on, surely lie in empty cells; 0 in an occupied one."""
+    size = clearance.shape[0]
     i, j, k = int(_scaled(x, size)), int(_scaled(y, size)), int(_scaled(z, size))
-    return occupied[min(i, size - 1), min(j, size - 1), min(k, size - 1)]
+    cells = clearance[min(i, size - 1), min(j, size - 1), min(k, size - 1)]
+    if cells <= 1:
+        return int(cells)
+    # From any point of a cell it is a cell less to the nearest occupied one.
+    return 1 + int(np.float32(cells - 1) * _CAREFUL / (np.float32(size) * max(length, _TINY)))
 
 
 @kernel
@@ -207,20 +216,28 @@ def march_rays(rays, start, end, lines, voxels, second, shares, min_transmittanc
         coarse_r, coarse_g, coarse_b, coarse_opacity, coarse_moment = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
         light, coarse_light = _ONE, _ONE
         length = _length(lines, ray, 0)
-        for sample in range(last + 1):
+        following = 0
+        while following <= last:
+            sample, following = following, following + 1
             if coarse_light <= min_transmittance or lacking == LOOKAHEAD:
                 break
             s = _HALF * (lines.edges[sample] + lines.edges[sample + 1])
             x, y, z = _point(lines, ray, s)
             infinite = lines.unbounded and sample == last
-            if not infinite and not _is_occupied(voxels.occupied, x, y, z):
-                continue
+            if not infinite:
+                empty = _empty_steps(voxels.clearance, x, y, z, _ENDLESS if lines.bent else length)
+                if empty > 0:
+                    following = sample + empty
+                    if lines.unbounded:
+                        following = min(following, last)
+                    continue
             u, v, w = _scaled(x, top), _scaled(y, top), _scaled(z, top)
             i, j, k = min(int(u), top - 1), min(int(v), top - 1), min(int(w), top - 1)
             fu, fv, fw = u - np.float32(i), v - np.float32(j), w - np.float32(k)
             words, near = _words(voxels, i, j, k), _corner_weights(fu, fv, fw)
             known, code, style_code = _densities(words, near)
-            style_density = _density(voxels, style_code)
+            density = _density(voxels, code)
+            style_density = density if style_code == code else _density(voxels, style_code)
             if second is not None:
                 second_words = _words(second, i, j, k)
                 both, _, other_code = _densities(second_words, near)
@@ -232,11 +249,11 @@ def march_rays(rays, start, end, lines, voxels, second, shares, min_transmittanc
                 continue
             if lines.bent:
                 length = _length(lines, ray, sample)
-            density = _density(voxels, code)
             left = _transmitted(density, length, infinite)
             coarse_weight = coarse_light * (_ONE - left)
             coarse_light *= left
-            left = _transmitted(_between(density, style_density, density_share), length, infinite)
+            if style_density != density:
+                left = _transmitted(_between(density, style_density, density_share), length, infinite)
             weight = light * (_ONE - left)
             light *= left
             coarse_opacity += coarse_weight

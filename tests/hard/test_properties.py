@@ -72,6 +72,7 @@ ELSEWHERE = {
     "sparsestyle_ns.rendering.few_samples": "takes a volume of a field's densities: test_few_samples.py",
     "sparsestyle_ns.rendering.render.frozen_field": "is what freeze_samples and render_frozen call",
     "sparsestyle_ns.rendering.render.render_frozen": "takes a volume of a field's densities: test_few_samples.py",
+    "sparsestyle_ns.rendering.baked.clearance_of": "takes cells: test_baked.py",
     "sparsestyle_ns.rendering.baked.march_compiled": "is what render_baked calls on a CPU",
 }
 """Modules and functions without a property of their own, and why."""

@@ -13,6 +13,7 @@ from sparsestyle_ns.rendering.baked import (
     DENSITY_UNIT,
     MAX_DENSITY,
     BakedVolume,
+    clearance_of,
     decode,
     encode,
     march_compiled,
@@ -163,17 +164,32 @@ def test_finer_voxels_come_closer_to_the_fields(space, fields):
     assert errors[-1] < min(0.004, 0.1 * errors[0])
 
 
+@pytest.mark.parametrize("cells, share", [(6, 0.6), (40, 0.001)])
 @pytest.mark.parametrize("min_transmittance", [0.0, 1e-3, 0.3])
 @pytest.mark.parametrize("space", SPACES)
-def test_the_compiled_march_is_the_one_in_torch(space, min_transmittance, fields):
-    occupancy = Occupancy(6)
+def test_the_compiled_march_is_the_one_in_torch(space, min_transmittance, cells, share, fields):
+    occupancy = Occupancy(cells)
     torch.manual_seed(1)
-    occupancy.occupied.copy_(torch.rand(6, 6, 6) < 0.6)
+    occupancy.occupied.copy_(torch.rand(cells, cells, cells) < share)
     rays = bundle(space, occupancy, min_transmittance)
     one, other = volume_of(fields), volume_of(fields)
     # The same codes, added up in another order.
     assert_renders(march_compiled([one], *rays, WHITE), march_in_torch([other], *rays, WHITE), tolerance=2e-6)
     assert_renders(march_compiled([other], *rays, WHITE), march_in_torch([one], *rays, WHITE), tolerance=2e-6)
+
+
+def test_clearance_is_the_distance_to_the_nearest_occupied_cell_and_follows_the_cells():
+    occupied = torch.zeros(21, 5, 4, dtype=torch.bool)
+    occupied[1, 2, 0] = occupied[0, 4, 3] = True
+    cells = torch.stack(torch.meshgrid(*map(torch.arange, occupied.shape), indexing="ij"), dim=-1)
+    expected = (cells[..., None, :] - occupied.nonzero()).abs().amax(dim=-1).amin(dim=-1).clamp(max=16)
+    assert torch.equal(clearance_of(occupied).long(), expected)
+
+    volume, occupancy = volume_of(Recorder()), Occupancy(4)
+    assert volume.clearance(occupancy).max() == 0
+    assert volume.clearance(occupancy) is volume.clearance(occupancy)
+    occupancy.occupied.zero_()
+    assert volume.clearance(occupancy).min() == 16
 
 
 @pytest.mark.parametrize("march", MARCHES)
