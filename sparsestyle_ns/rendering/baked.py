@@ -176,7 +176,7 @@ class BakedVolume:
 
 
 def clearance_of(occupied: Bool[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
-    """How many cells away the nearest occupied one is, along the axis on which it is farthest; at most `MOST_CLEARANCE`.
+    """How many cells away the nearest occupied one is, on the axis where it is farthest; at most `MOST_CLEARANCE`.
 
     Empty space is crossed in leaps (Zuiderveld et al. 1992).
     """
