@@ -11,7 +11,7 @@ from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.utils.errors import exit_on_input_error
 
 SIDE = 252
-TARGET = 10.0
+TARGET = 60.0
 
 
 @exit_on_input_error
