@@ -17,7 +17,7 @@ _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _SHADE = np.float32(1.0 / 255.0)
 _DEPTH_CAP = np.float32(MAX_OPTICAL_DEPTH)
 _UNSEEN = np.float32(2e-4)  # of a ray's weight: with less, a sample has no colour, only opacity
-_TINY, _ENDLESS = np.float32(1e-12), np.float32(np.inf)
+_ENDLESS, _FARTHEST = np.float32(np.inf), np.float32(1e6)
 _CAREFUL = np.float32(2 * 0.999)  # the cube's side, but for rounding
 _LEAST_DISPARITY = np.float32(0.5 / MAX_DISTANCE)
 _BYTE, _NO_BYTE = np.uint64(255), np.uint64(0)
@@ -95,7 +95,8 @@ def _empty_steps(clearance, x, y, z, length):
     if cells <= 1:
         return int(cells)
     # From any point of a cell it is a cell less to the nearest occupied one.
-    return 1 + int(np.float32(cells - 1) * _CAREFUL / (np.float32(size) * max(length, _TINY)))
+    leap = np.float32(cells - 1) * _CAREFUL / (np.float32(size) * length)
+    return 1 + int(leap) if leap < _FARTHEST else 1  # no number passes neither
 
 
 @kernel

@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 from conftest import decided
@@ -14,7 +15,8 @@ from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace, contract, intersect_box
 from sparsestyle_ns.effects.layouts import build_space
 from sparsestyle_ns.fields.coarse import CoarseField
-from sparsestyle_ns.rendering.baked_kernels import _is_occupied
+from sparsestyle_ns.rendering.baked import clearance_of
+from sparsestyle_ns.rendering.baked_kernels import _empty_steps
 from sparsestyle_ns.rendering.render import render_coarse
 
 FOCAL = (1.6, 2.1)
@@ -268,8 +270,24 @@ def test_points_outside_belong_to_the_nearest_cell(size):
     point = torch.tensor([[size, -size, -0.3]])
     assert grid.cells(point).tolist() == [(7 * 8 + 0) * 8 + 2]
     assert occupancy.contains(point).tolist() == [True]
-    assert _is_occupied(occupancy.occupied.numpy(), *point[0].numpy())
+    clearance = clearance_of(occupancy.occupied).numpy()
+    assert _empty_steps(clearance, *point[0].numpy(), np.float32(0.1)) == 0
     assert grid.cells(torch.full((1, 3), math.nan)).tolist() == [0]
+
+
+@hard_case(
+    "geometry",
+    case="steps through empty cells of a length of 0, 1e-30, 1e30, ∞ or no number",
+    could_go_wrong="a leap of a negative or endless number of steps, out of the arrays or never ending",
+    must_hold="at least one step and no more than the empty cells have",
+)
+@pytest.mark.parametrize("length", [0.0, 1e-30, 1e-3, 0.2, 1e30, math.inf, math.nan])
+def test_a_leap_over_empty_cells_is_one_step_at_least_and_ends_before_the_occupied_ones(length):
+    clearance = np.zeros((8, 8, 8), dtype=np.uint8)
+    clearance[:, :, :] = 5
+    steps = _empty_steps(clearance, *np.zeros(3, dtype=np.float32), np.float32(length))
+    assert steps >= 1
+    assert not (steps - 1) * length > 4 * 2 / 8
 
 
 @hard_case(
