@@ -31,7 +31,7 @@ def coarse_optimizers(iterations: int) -> Dict[str, Any]:
         return ExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=iterations)
 
     muon = {"optimizer": MuonConfig(lr=0.02), "scheduler": falling(4e-4)}
-    return {"fields": adam(1e-3, falling(1e-4)), "hidden_layers": muon}
+    return {"fields": adam(1e-3, falling(1e-4)), "hidden_layers": muon, "cameras": adam(1e-3, falling(1e-5))}
 
 
 def style_optimizers(milestones: Sequence[int]) -> Dict[str, Any]:
@@ -139,7 +139,7 @@ coarse_fewshot_paper = variant(
         "pipeline.datamanager.train_num_rays_per_batch": 1024,
         "pipeline.effects": EffectSettings(view_color="on", matched_depth="off"),
         "pipeline.model.distortion_weight": 0.0,
-        "optimizers": {"fields": adam(5e-4), "hidden_layers": adam(5e-4)},
+        "optimizers": {"fields": adam(5e-4), "hidden_layers": adam(5e-4), "cameras": adam(5e-4)},
     },
 )
 

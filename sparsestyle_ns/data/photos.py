@@ -3,7 +3,7 @@
 import copy
 from collections import Counter
 from pathlib import Path
-from typing import Any, Dict, List, Literal, Sequence, Tuple
+from typing import Any, Callable, Dict, List, Literal, Optional, Sequence, Tuple
 
 import numpy as np
 import torch.nn.functional as F
@@ -117,7 +117,24 @@ def _check_content(path: Path, pixels: UInt8[np.ndarray, "H W channels"]) -> Non
 
 
 class PhotoDataset(InputDataset):
-    """nerfstudio's dataset of images, which raises an `InputError` for those that can't be used."""
+    """nerfstudio's dataset of images, which raises an `InputError` for those that can't be used.
+
+    Its `cameras` are as refined as they are by now, where `refine` is set.
+    """
+
+    refine: Optional[Callable[[Cameras], Cameras]] = None
+    """What became of the cameras that the dataparser gives."""
+    given_cameras: Cameras
+    """These, at the photos' size."""
+
+    @property
+    def cameras(self) -> Cameras:
+        """The photos' cameras."""
+        return self.given_cameras if self.refine is None else self.refine(self.given_cameras)
+
+    @cameras.setter
+    def cameras(self, cameras: Cameras) -> None:
+        self.given_cameras = cameras
 
     def get_numpy_image(self, image_idx: int) -> UInt8[np.ndarray, "H W channels"]:
         """Pixels of a photo, RGB or RGBA, at the size of its camera."""

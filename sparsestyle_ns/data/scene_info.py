@@ -38,12 +38,14 @@ class SceneInfo:
         ndc: None where the bounds of depth aren't known.
         standard_views: ids of the few views that papers train on, in their order; None: views at even steps.
         default_num_views: how many views to train on unless `--num-views` says otherwise.
+        poses_estimated: whether the cameras were estimated from these few photos, and so are not quite right.
     """
 
     view_ids: Tuple[int, ...]
     ndc: Optional[NDC] = None
     standard_views: Optional[Tuple[int, ...]] = None
     default_num_views: int = 8
+    poses_estimated: bool = False
 
 
 def scene_info(outputs: DataparserOutputs) -> SceneInfo:

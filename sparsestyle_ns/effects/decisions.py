@@ -33,6 +33,8 @@ class EffectSettings:
     """Lens distortion: where the cameras' distortion parameters move pixels."""
     matched_depth: EffectChoice = "auto"
     """Depth of points that two photos share, found by matching."""
+    pose_refinement: EffectChoice = "auto"
+    """Cameras learned with the field: where their poses were estimated from the photos alone."""
     empty_space: EffectChoice = "auto"
     """Empty-space skipping: where enough of space is empty; decided again while stage 1 trains."""
     residual_density: EffectChoice = "auto"

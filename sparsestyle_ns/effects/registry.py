@@ -10,6 +10,7 @@ from sparsestyle_ns.effects.lens_distortion import measure_lens_distortion
 from sparsestyle_ns.effects.matched_colors import measure_exposure, measure_view_color
 from sparsestyle_ns.effects.matched_depth import measure_matched_depth
 from sparsestyle_ns.effects.palette import measure_palette
+from sparsestyle_ns.effects.pose_refinement import measure_pose_refinement
 from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.utils.errors import InputError
 
@@ -30,6 +31,7 @@ EFFECTS: Dict[str, Effect] = {
     "exposure": Effect(measure_exposure),
     "lens_distortion": Effect(measure_lens_distortion),
     "matched_depth": Effect(measure_matched_depth),
+    "pose_refinement": Effect(measure_pose_refinement),
     "empty_space": Effect(measure_empty_space, source="coarse field"),
     "residual_density": Effect(measure_residual_density, source="coarse field"),
     "palette": Effect(measure_palette, source="style image"),

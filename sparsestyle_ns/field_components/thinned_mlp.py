@@ -55,13 +55,8 @@ def thinned_mlp(
     """What each of `heads` makes of the last of the hidden layers, which have ReLUs between and after them.
 
     The values are those of the layers themselves, in the format that autocast asks for. Gradients reach the layers'
-    parameters, from the points that `thin` keeps, and not the inputs.
-
-    Raises:
-        ValueError: the inputs ask for a gradient.
+    parameters and, where they ask for one, the inputs, from the points that `thin` keeps; the others' inputs get 0.
     """
-    if inputs.requires_grad:
-        raise ValueError("thinned_mlp gives its inputs no gradient, but they ask for one; detach them.")
     # Heads share one product.
     weight, bias = (torch.cat(parts) for parts in zip(*((head.weight, head.bias) for head in heads), strict=True))
     parameters = [part for layer in hidden for part in (layer.weight, layer.bias)]
@@ -99,4 +94,9 @@ class _ThinnedMLP(torch.autograd.Function):
             found += [gradients.sum(dim=0, dtype=torch.promote_types(dtype, torch.float32)), gradients.t() @ layer]
             if number > 0:
                 gradients = torch.ops.aten.threshold_backward(gradients @ weights[number], layer, 0.0)
-        return None, None, *reversed(found)
+        of_inputs = None
+        if ctx.needs_input_grad[1]:
+            of_inputs = gradients @ weights[0]
+            if ctx.thinning.threshold > 0:  # the point that fills up is there more than once, so rows are added
+                of_inputs = torch.zeros_like(layers[0]).index_add_(0, kept, of_inputs)
+        return None, of_inputs, *reversed(found)

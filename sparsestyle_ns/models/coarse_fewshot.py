@@ -100,12 +100,13 @@ class CoarseFewShotModel(SceneModel):
             self.grid = DensityGrid(self.config.grid_resolution).to(next(self.field.parameters()).device)
 
     def get_param_groups(self) -> Dict[str, List[Parameter]]:
-        """The matrices of hidden layers, and all else: the field's rest, and exposures where they are learned."""
+        """The matrices of hidden layers; cameras where they are learned; and all else, with exposures where they are."""
         exposure = [] if self.exposure is None else list(self.exposure.parameters())
         matrices = self.field.hidden_matrices()
         names = {id(matrix) for matrix in matrices}
         rest = [parameter for parameter in self.field.parameters() if id(parameter) not in names]
-        return {"fields": [*rest, *exposure], "hidden_layers": matrices}
+        groups = {"fields": [*rest, *exposure], "hidden_layers": matrices}
+        return groups if self.refinement is None else {**groups, "cameras": self.refinement.learned()}
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

@@ -82,8 +82,9 @@ class HierStyleModel(SceneModel):
         self.residual = self.new_style()
         self.volume = DensityVolume(config.occupancy_resolution)
         self.occupancy = Occupancy(config.occupancy_resolution) if effects.on("empty_space") else None
-        if self.exposure is not None:
-            self.exposure.requires_grad_(False)
+        for part in (self.exposure, self.refinement):
+            if part is not None:
+                part.requires_grad_(False)
         for name in ("strength", "geometry_strength"):
             if not 0.0 <= (value := getattr(config, name)) <= 1.0:
                 flag = name.replace("_", "-")
@@ -134,7 +135,7 @@ class HierStyleModel(SceneModel):
     @torch.no_grad()
     def adopt_coarse(self, state: Dict[str, Tensor]) -> None:
         """Takes over the state of a `CoarseFewShotModel` with these settings, and finds out which cells are empty."""
-        for name in ("field", "space", "exposure"):
+        for name in ("field", "space", "exposure", "refinement"):
             if getattr(self, name) is not None:
                 part = {key[len(name) + 1 :]: value for key, value in state.items() if key.startswith(name + ".")}
                 getattr(self, name).load_state_dict(part, strict=True)

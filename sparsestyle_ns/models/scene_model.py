@@ -12,6 +12,7 @@ from sparsestyle_ns.effects.background import background_color
 from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.effects.layouts import build_space
 from sparsestyle_ns.effects.matched_colors import build_exposure
+from sparsestyle_ns.effects.pose_refinement import CameraRefinement
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 
 
@@ -31,10 +32,10 @@ class SceneModelConfig(ModelConfig):
 
 
 class SceneModel(Model):
-    """A model of a scene, with its space, its background colour and its photos' exposures.
+    """A model of a scene, with its space, its background colour, and its photos' exposures and refined cameras.
 
-    `scene_box` is in NDC where there is `ndc`, the dataparser's map to it, else in the world; among `kwargs` is the
-    `device` that the model will be moved to.
+    `scene_box` is in NDC where there is `ndc`, the dataparser's map to it, else in the world; among `kwargs` are the
+    `device` that the model will be moved to and, where cameras are refined, the `refinement`.
     """
 
     def __init__(
@@ -54,4 +55,5 @@ class SceneModel(Model):
         super().populate_modules()
         self.space = build_space(self.effects, self.scene_box, self.ndc)
         self.exposure = build_exposure(self.effects, self.num_train_data)
+        self.refinement: Optional[CameraRefinement] = self.kwargs.get("refinement")
         self.register_buffer("background", background_color(self.effects), persistent=False)

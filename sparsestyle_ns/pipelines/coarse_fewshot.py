@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional, Tuple, Type
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
@@ -12,6 +13,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sparsestyle_ns.core.camera_paths import unseen_places
+from sparsestyle_ns.core.triangulation import reprojection_errors
 from sparsestyle_ns.effects.registry import decide_again
 from sparsestyle_ns.losses.coarse import pooled_features, semantic_loss
 from sparsestyle_ns.losses.stylization import fit_side
@@ -32,6 +34,8 @@ class CoarseFewShotPipelineConfig(CheckedPipelineConfig):
     _target: Type = field(default_factory=lambda: CoarseFewShotPipeline)
     model: ModelConfig = field(default_factory=CoarseFewShotModelConfig)
     """The coarse field and how it is trained."""
+    reprojection_weight: float = 1e-3
+    """Weight of the distance, in pixels, by which rays to matched points miss each other, where cameras are refined."""
     semantic_weight: float = 0.0
     """Weight of the semantic loss (DietNeRF's, with VGG-16 for CLIP; 0.1 there): views between the photos must look
     like one of them to the feature network. 0 is off, and needs no network."""
@@ -124,11 +128,21 @@ class CoarseFewShotPipeline(CheckedPipeline):
     def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Any], Dict[str, Tensor], Dict[str, Any]]:
         """Outputs, losses and metrics of a batch and, every `semantic_every` iterations, the loss of an unseen view."""
         outputs, losses, metrics = super().get_train_loss_dict(step)
+        if self.model.refinement is not None and self.datamanager.matched is not None:
+            losses["reprojection_loss"] = self.config.reprojection_weight * self._reprojection_loss()
         if self.unseen is not None and step % self.config.semantic_every == 0:
             # Which view and which photo depends on the data manager's seed and the step alone.
             generator = torch.Generator().manual_seed(self.datamanager.config.seed * 1_000_003 + step)
             losses["semantic_loss"] = self.config.semantic_weight * self.unseen.loss(self.model, generator)
         return outputs, losses, metrics
+
+    def _reprojection_loss(self) -> Float[Tensor, ""]:
+        """How far both photos' rays to matched points miss each other, in pixels; errors over one count by their size."""
+        manager = self.datamanager
+        points = torch.arange(len(manager.matched) // 2, device=self.device)
+        errors = reprojection_errors(*manager.matched_pairs(points), 0.0)
+        pixels = errors * float(manager.train_dataset.given_cameras.fx.mean())
+        return F.huber_loss(pixels, torch.zeros_like(pixels))
 
     def decide_empty_space(self, step: int) -> None:
         """After every tenth of the iterations from three quarters on, measures whether skipping empty space pays."""

@@ -4,7 +4,7 @@ import functools
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Dict, Literal, Optional, Tuple, Type, Union
+from typing import Annotated, Any, Callable, Dict, Literal, Optional, Tuple, Type, Union
 
 import torch
 import tyro
@@ -23,12 +23,14 @@ from nerfstudio.data.utils.dataloaders import RandIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from sparsestyle_ns.core.triangulation import distances_to_meeting
 from sparsestyle_ns.data.photos import SMALLEST_SIDE, PhotoDataset, at_scale, at_size, check_one_size, reduced
 from sparsestyle_ns.data.reading import read_scene
 from sparsestyle_ns.data.scene_info import scene_info, select_outputs
 from sparsestyle_ns.data.view_selection import select_views
 from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.effects.matched_depth import MatchedRays, matched_rays
+from sparsestyle_ns.effects.pose_refinement import CameraRefinement, carried_along
 from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.utils.distributed import num_processes
 from sparsestyle_ns.utils.errors import InputError
@@ -55,7 +57,7 @@ class FewShotDataManagerConfig(VanillaDataManagerConfig):
 
 @dataclass
 class TrainingPixels:
-    """All pixels of the training views, view by view and row by row, with their world rays."""
+    """All pixels of the training views, view by view and row by row, with their world rays by the given cameras."""
 
     origins: Float[Tensor, "pixels 3"]
     directions: Float[Tensor, "pixels 3"]
@@ -87,6 +89,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
     effects: Optional[Decisions] = None
     pixels: TrainingPixels
     """Once they are loaded."""
+    _refined_rays: Optional[Callable[[Tensor, Tensor, Tensor], Tuple[Tensor, Tensor]]] = None
 
     def __init__(
         self,
@@ -165,9 +168,31 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         self.effects = effects
         if not effects.on("lens_distortion"):
             for dataset in (self.train_dataset, self.eval_dataset):
-                dataset.cameras.distortion_params = None
+                dataset.given_cameras.distortion_params = None
         if self.test_mode != "inference":
             self.load_pixels()
+
+    def refine_cameras(self, refinement: Optional[CameraRefinement]) -> None:
+        """From now on training cameras, and rays of training batches, are as this has refined them by then.
+
+        Held-out cameras go with them, by the similarity that lays the given training cameras over the refined ones.
+        """
+        if refinement is None:
+            return
+        self._refined_rays = refinement.forward  # no module, which would be part of the state twice
+        self.train_dataset.refine = refinement.cameras
+        is_held_out = self.eval_dataset.image_filenames != self.train_dataset.image_filenames
+        self.eval_dataset.refine = self._carried_along if is_held_out else refinement.cameras
+
+    def _carried_along(self, cameras: Cameras) -> Cameras:
+        given, refined = self.train_dataset.given_cameras, self.train_dataset.cameras
+        return carried_along(cameras, given, refined)
+
+    def refined_rays(
+        self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], views: Int[Tensor, "rays"]
+    ) -> Tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
+        """Rays of given training cameras, as they are by the refined ones; differentiable where these are learned."""
+        return (origins, directions) if self._refined_rays is None else self._refined_rays(origins, directions, views)
 
     def load_pixels(self) -> None:
         """Loads the training photos with all their rays, unless that is done already."""
@@ -175,7 +200,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
             self.pixels = self.pixels_at(1.0)
 
     def pixels_at(self, scale: float) -> TrainingPixels:
-        """The training photos, reduced to a share of their size, with all their rays."""
+        """The training photos, reduced to a share of their size, with all their rays by the given cameras."""
         loaded = scale == 1.0 and hasattr(self, "pixels")
         return self.pixels if loaded else gather_pixels(self.train_dataset, self.device, scale)
 
@@ -225,9 +250,24 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
             pick = torch.randint(len(matched), (extra,), generator=generator, device=self.device)
             known = matched.origins[pick], matched.directions[pick], matched.views[pick]
             rays = tuple(map(torch.cat, zip(rays, known, strict=True)))
-            distances = matched.distances[pick]
+            distances = matched.distances[pick] if self._refined_rays is None else self._distances_now(pick)
             metadata["matched_distance"] = torch.cat([distances.new_zeros(count, 1), distances])
-        return bundle_rays(*rays, metadata), {"image": pixels.colors[chosen]}
+        *bent, views = rays
+        return bundle_rays(*self.refined_rays(*bent, views), views, metadata), {"image": pixels.colors[chosen]}
+
+    def matched_pairs(self, points: Int[Tensor, "points"]) -> Tuple[Float[Tensor, "2 points 3"], ...]:
+        """Origins and directions of both photos' rays to some matched points, by the refined cameras."""
+        matched, half = self.matched, len(self.matched) // 2
+        both = torch.cat([points, points + half])
+        rays = self.refined_rays(matched.origins[both], matched.directions[both], matched.views[both])
+        return tuple(part.view(2, -1, 3) for part in rays)
+
+    @torch.no_grad()
+    def _distances_now(self, pick: Int[Tensor, "rays"]) -> Float[Tensor, "rays 1"]:
+        """Distances of matched points along rays, by the cameras as they are refined by now."""
+        half = len(self.matched) // 2
+        distances = distances_to_meeting(*self.matched_pairs(pick % half))
+        return distances[pick // half, torch.arange(len(pick), device=pick.device)][:, None]
 
     def get_train_rays_per_batch(self) -> int:
         """Rays of a batch that this process renders."""
@@ -239,10 +279,10 @@ def has_one_size(cameras: Cameras) -> bool:
     return len(cameras.width.unique()) == len(cameras.height.unique()) == 1
 
 
-def gather_pixels(dataset: InputDataset, device: Union[str, torch.device], scale: float = 1.0) -> TrainingPixels:
+def gather_pixels(dataset: PhotoDataset, device: Union[str, torch.device], scale: float = 1.0) -> TrainingPixels:
     """Loads all images of a dataset, at a share of their size in (0, 1], and generates the ray of each pixel."""
     parts, starts, sizes = [], [0], []
-    cameras = at_scale(dataset.cameras, scale)
+    cameras = at_scale(dataset.given_cameras, scale)
     for index in range(len(dataset)):
         data = dataset[index]
         size = int(cameras.height[index]), int(cameras.width[index])

@@ -14,6 +14,7 @@ from torch.amp import GradScaler
 
 from sparsestyle_ns.data.scene_info import scene_info
 from sparsestyle_ns.effects.decisions import Decisions, EffectSettings
+from sparsestyle_ns.effects.pose_refinement import build_camera_refinement
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.evaluation.held_out import HeldOutReport, evaluate_held_out
 from sparsestyle_ns.losses.stylization import StyleTargets
@@ -77,14 +78,16 @@ class CheckedPipeline(VanillaPipeline):
         self.datamanager.to(device)
         self.effects = config.decided or decide(self.datamanager.scene, config.effects)
         self.datamanager.set_effects(self.effects)
-        dataset = self.datamanager.train_dataset
+        dataset, ndc = self.datamanager.train_dataset, scene_info(self.datamanager.train_dataparser_outputs).ndc
         self._model = config.model.setup(
             scene_box=dataset.scene_box,
             num_train_data=len(dataset),
             effects=self.effects,
-            ndc=scene_info(self.datamanager.train_dataparser_outputs).ndc,
+            ndc=ndc,
+            refinement=build_camera_refinement(self.effects, dataset.cameras, None if ndc is None else ndc.near),
             device=device,
         ).to(device)
+        self.datamanager.refine_cameras(self.model.refinement)
         CONSOLE.print("Effects:", self.effects.text(), sep="\n", soft_wrap=True, highlight=False)
         self.panel = None if config.panel is None else config.panel(self)  # nerfstudio's viewer finds it here
         if test_mode != "val":

@@ -62,7 +62,7 @@ class SceneViews:
         samples_per_chunk: int,
         cache_gigabytes: Optional[float],
     ) -> None:
-        self.model, self.samples_per_chunk = model, samples_per_chunk
+        self.model, self.samples_per_chunk, self._rays_of = model, samples_per_chunk, manager.refined_rays
         self.num_photos = len(manager.train_dataset)
         if cache_gigabytes is None:
             on_gpu = model.device.type == "cuda"
@@ -92,7 +92,7 @@ class SceneViews:
 
     def _photo_view(self, pixels: TrainingPixels, index: int) -> ContentView:
         (height, width), rows = pixels.sizes[index], pixels.rows(index)
-        frozen = self._freeze(pixels.origins[rows], pixels.directions[rows])
+        frozen = self._freeze(*self._rays_of(pixels.origins[rows], pixels.directions[rows], pixels.views[rows]))
         accumulation = gather_rays(frozen.render(accumulation_of), height * width)
         colors, exposure = pixels.colors[rows], self.model.exposure
         if exposure is not None:

@@ -1,0 +1,121 @@
+"""Cameras that were estimated from the photos themselves: stage 1 learns how far each is off.
+
+Three photos with some hundred matched points leave a tenth of the focal length open, and tenths of a degree of each
+camera. As BARF (Lin et al. 2021) and Nope-NeRF (Bian et al. 2023) do, the cameras are learned with the field.
+"""
+
+import copy
+from typing import List, Optional, Tuple
+
+import torch
+from jaxtyping import Float, Int
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from sparsestyle_ns.core.camera_paths import meeting_point
+from sparsestyle_ns.core.rotations import rotation_matrix, similarity_between
+from sparsestyle_ns.data.scene_info import scene_info
+from sparsestyle_ns.effects.decisions import Decisions, Measurement
+from sparsestyle_ns.effects.scene import Scene
+
+DISTORTION_POWERS = (2, 4, 6, 8, 1, 1)
+"""Powers of the focal length by which k1 to k4, p1 and p2 change so that the lens moves each pixel as before."""
+
+
+def measure_pose_refinement(scene: Scene) -> Measurement:
+    """Whether the scene's poses were estimated from its photos."""
+    info = scene_info(scene.outputs)
+    words = "poses were estimated from these photos" if info.poses_estimated else "poses are known"
+    return Measurement(info.poses_estimated, words)
+
+
+class CameraRefinement(nn.Module):
+    """Where each photo was taken, as a change of what the dataparser says, and one factor of all focal lengths.
+
+    A camera turns and moves along its own axes (right, up, back): R exp(ω), o + u R t. The focal length changes a ray's
+    slope against its camera's axis. All three change nothing at 0.
+
+    Args:
+        poses: camera-to-world, as the dataparser has them.
+        unit: u, in the world: how far the nearest things are, about, so that turns in radians and moves in units change
+            a picture alike.
+        has_focal: whether the focal length is learned.
+    """
+
+    axes: Float[Tensor, "views 3 3"]
+
+    def __init__(self, poses: Float[Tensor, "views 3 4"], unit: float, has_focal: bool = True) -> None:
+        super().__init__()
+        self.unit = unit
+        self.register_buffer("axes", poses[..., :3].float().clone(), persistent=False)
+        self.turn = nn.Parameter(torch.zeros(len(poses), 3))
+        self.move = nn.Parameter(torch.zeros(len(poses), 3))
+        self.log_focal = nn.Parameter(torch.zeros(()), requires_grad=has_focal)
+
+    def forward(
+        self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], views: Int[Tensor, "rays"]
+    ) -> Tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
+        """Rays of the photos' pixels, unit directions, as they are by the refined cameras; differentiable."""
+        turned = self.axes @ rotation_matrix(self.turn)
+        # In a camera's own axes; a longer lens spreads rays less.
+        own = torch.einsum("nij,ni->nj", self.axes[views], directions)
+        own = torch.cat([own[:, :2], own[:, 2:] * self.log_focal.exp()], dim=-1)
+        directions = normalize(torch.einsum("nij,nj->ni", turned[views], own), dim=-1)
+        moves = self.unit * (self.axes @ self.move[..., None]).squeeze(-1)
+        return origins + moves[views], directions
+
+    @torch.no_grad()
+    def cameras(self, cameras: Cameras) -> Cameras:
+        """The refined cameras of those that the dataparser gives for the same photos."""
+        refined = copy.deepcopy(cameras)
+        poses = cameras.camera_to_worlds
+        axes, turn, move, focal = (
+            part.to(poses) for part in (self.axes, self.turn, self.move, self.log_focal.exp())
+        )
+        positions = poses[..., 3] + self.unit * (axes @ move[..., None]).squeeze(-1)
+        refined.camera_to_worlds = torch.cat([axes @ rotation_matrix(turn), positions[..., None]], dim=-1)
+        return with_focal(refined, float(focal))
+
+    def learned(self) -> List[nn.Parameter]:
+        """What an optimiser is to learn."""
+        return [part for part in self.parameters() if part.requires_grad]
+
+    @torch.no_grad()
+    def change(self) -> Tuple[float, float, float]:
+        """The largest turn in degrees, the largest move in `unit`, and the factor of the focal length."""
+        turn = float(self.turn.norm(dim=-1).max().rad2deg())
+        return turn, float(self.move.norm(dim=-1).max()), float(self.log_focal.exp())
+
+
+def carried_along(cameras: Cameras, given: Cameras, refined: Cameras) -> Cameras:
+    """Cameras of the world of `given` ones in that of the same ones `refined`, by the similarity between these."""
+    moved = copy.deepcopy(cameras)
+    poses = (each.camera_to_worlds.double() for each in (given, refined))
+    own = cameras.camera_to_worlds
+    moved.camera_to_worlds = similarity_between(*poses).of_poses(own.double()).to(own)
+    return with_focal(moved, float((refined.fx / given.fx).mean()))
+
+
+def with_focal(cameras: Cameras, factor: float) -> Cameras:
+    """The cameras with other focal lengths, for lenses that move each pixel as before; they are changed in place."""
+    cameras.fx, cameras.fy = cameras.fx * factor, cameras.fy * factor
+    if cameras.distortion_params is not None:
+        powers = cameras.distortion_params.new_tensor(DISTORTION_POWERS)
+        cameras.distortion_params = cameras.distortion_params * factor**powers
+    return cameras
+
+
+def build_camera_refinement(effects: Decisions, cameras: Cameras, near: Optional[float]) -> Optional[CameraRefinement]:
+    """What stage 1 learns of the cameras; None where the effect is off.
+
+    Args:
+        near: how far the nearest things are, in the world; None: half as far as the point that all cameras look at.
+    """
+    if not effects.on("pose_refinement"):
+        return None
+    poses = cameras.camera_to_worlds
+    if near is None:
+        near = 0.5 * float((poses[..., 3] - meeting_point(poses)).norm(dim=-1).median())
+    is_perspective = bool((cameras.camera_type == CameraType.PERSPECTIVE.value).all())
+    return CameraRefinement(poses, near, has_focal=is_perspective)
