@@ -19,11 +19,14 @@ from typing import Annotated, List, Literal, Optional, Sequence
 import tyro
 from _command_line import check_ranges, parse, print_made
 from _flight import flight
-from _stages import Stage, StageFailedError, clock, run_stages
+
+from sparsestyle_ns.utils.stages import Stage, StageFailedError, clock, run_stages
 
 SCRIPTS = Path(__file__).resolve().parent
 COARSE, STYLE = "coarse-fewshot-draft", "hier-style-draft"
 CHECKPOINTS = "outputs/*/{}/*/nerfstudio_models/*.ckpt"
+STAGE_1 = {"seconds": 60.0, "works": {"Stage 1": 0.1}}
+STAGE_2 = {"seconds": 80.0, "works": {"Stage 2": 0.3}}
 DRAFT = tyro.conf.arg(metavar="INT", help_behavior_hint="(default: the draft's own)")
 
 
@@ -81,12 +84,12 @@ def make_stages(options: Options) -> List[Stage]:
 
     rendering = f"{options.frames} frames of {options.film_side} pixels" + ", also as pictures" * options.images
     return [
-        Stage("scene", "Photographing a sample scene", [make_scene], f"scene/{scene.name}/*"),
-        Stage("style", "Painting a style image", [make_style], style.name),
-        Stage("coarse", "Stage 1: a scene from a few photos", [coarse], CHECKPOINTS.format(COARSE)),
-        Stage("stylised", "Stage 2: the painting's style", [stylised], CHECKPOINTS.format(STYLE)),
-        Stage("film", "Filming a flight through the scene", render, film.name, rendering),
-        Stage("page", "Laying out the page", show, page.name),
+        Stage("scene", "Photographing a sample scene", [make_scene], f"scene/{scene.name}/*", seconds=15.0),
+        Stage("style", "Painting a style image", [make_style], style.name, seconds=5.0),
+        Stage("coarse", "Stage 1: a scene from a few photos", [coarse], CHECKPOINTS.format(COARSE), **STAGE_1),
+        Stage("stylised", "Stage 2: the painting's style", [stylised], CHECKPOINTS.format(STYLE), **STAGE_2),
+        Stage("film", "Filming a flight through the scene", render, film.name, rendering, 50.0),
+        Stage("page", "Laying out the page", show, page.name, seconds=30.0),
     ]
 
 

@@ -14,6 +14,7 @@ from sparsestyle_ns.export.export_options import ExportOptions
 from sparsestyle_ns.gallery.gallery_options import GalleryOptions
 from sparsestyle_ns.prepare.prepare_options import EffectsOptions, PrepareOptions
 from sparsestyle_ns.studies.study_options import AblateOptions, CompareOptions, TradeoffOptions
+from sparsestyle_ns.stylise.stylise_options import StyliseOptions
 from sparsestyle_ns.utils.errors import CommandOptions, exit_on_input_error
 
 SUBCOMMANDS: Dict[str, Tuple[Type[CommandOptions], str]] = {
@@ -24,6 +25,7 @@ SUBCOMMANDS: Dict[str, Tuple[Type[CommandOptions], str]] = {
     "export": (ExportOptions, "export.export_run:export_run"),
     "gallery": (GalleryOptions, "gallery.make_gallery:make_gallery"),
     "prepare": (PrepareOptions, "prepare.prepare_scene:prepare"),
+    "stylise": (StyliseOptions, "stylise.stylise:stylise"),
     "tradeoff": (TradeoffOptions, "studies.tradeoff:tradeoff"),
 }
 """Each subcommand's options, and the function that takes them."""

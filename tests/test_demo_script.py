@@ -1,18 +1,18 @@
-"""The demo's flight looks where it should, and what is finished isn't done again."""
+"""The demo's flight looks where it should, and its stages are the commands that one would type."""
 
 import importlib
 import json
 import os
 import shlex
 
-import _stages
 import numpy as np
 import pytest
 import torch
 from _flight import camera_path, ellipse_path, flight, orbit_path
-from _stages import Stage, StageFailedError, run_command, run_stages, without_config
 from nerfstudio.cameras.camera_paths import get_path_from_json
 from PIL import Image
+
+from sparsestyle_ns.utils.stages import StageFailedError
 
 # The demo makes a folder of the same name, and ruff would sort `import demo` by whether it is there.
 demo = importlib.import_module("demo")
@@ -115,93 +115,6 @@ def test_flight_around_a_blender_scene_has_its_pictures_shape_and_angle(tmp_path
     path = flight("blender", tmp_path, tmp_path, frames=4, longer_side=30)
     assert (path["render_width"], path["render_height"]) == (30, 20)
     assert get_path_from_json(path).fx[0].item() == pytest.approx(15.0)
-
-
-def append(folder, name):
-    """A stage that adds a line to a file, so that one can count how often it ran."""
-    code = f"open({str(folder / name)!r}, 'a').write('ran\\n')"
-    return Stage(name, f"Writing {name}", [["python", "-c", code]], name)
-
-
-def times_run(folder):
-    return {path.name: len(path.read_text().splitlines()) for path in folder.iterdir() if path.is_file()}
-
-
-def test_finished_stages_are_not_done_again(tmp_path, capsys):
-    stages = [append(tmp_path, "first"), append(tmp_path, "second")]
-    run_stages(tmp_path, stages)
-    run_stages(tmp_path, stages)
-    assert times_run(tmp_path) == {"first": 1, "second": 1}
-    assert capsys.readouterr().out.count("done before") == 2
-
-
-def test_force_does_all_again(tmp_path):
-    stages = [append(tmp_path, "first"), append(tmp_path, "second")]
-    run_stages(tmp_path, stages)
-    run_stages(tmp_path, stages, force=True)
-    assert times_run(tmp_path) == {"first": 2, "second": 2}
-
-
-def test_changed_settings_and_all_that_follows_are_done_again(tmp_path):
-    first, second, third = (append(tmp_path, name) for name in ("first", "second", "third"))
-    run_stages(tmp_path, [first, second, third])
-    second.settings = "48 frames"
-    run_stages(tmp_path, [first, second, third])
-    assert times_run(tmp_path) == {"first": 1, "second": 2, "third": 2}
-
-
-def test_stage_whose_product_is_gone_is_done_again(tmp_path):
-    stages = [append(tmp_path, "first"), append(tmp_path, "second")]
-    run_stages(tmp_path, stages)
-    (tmp_path / "first").unlink()
-    run_stages(tmp_path, stages)
-    assert times_run(tmp_path) == {"first": 1, "second": 2}
-
-
-def test_failed_stage_ends_with_its_last_lines_and_is_done_again(tmp_path):
-    code = "import sys; [print(f'line {i}') for i in range(30)]; sys.exit(3)"
-    failing = Stage("second", "Failing", [["python", "-c", code]], "second")
-    with pytest.raises(StageFailedError) as failure:
-        run_stages(tmp_path, [append(tmp_path, "first"), failing])
-    lines = str(failure.value).splitlines()
-    assert lines[0] == "Failing: python ended with exit status 3; its last lines were"
-    assert [line.strip() for line in lines[1:]] == [f"line {i}" for i in range(10, 30)]
-    run_stages(tmp_path, [append(tmp_path, "first"), append(tmp_path, "second")])
-    assert times_run(tmp_path) == {"first": 1, "second": 1}
-
-
-def test_stage_that_makes_nothing_fails(tmp_path):
-    idle = Stage("idle", "Doing nothing", [["python", "-c", "pass"]], "something")
-    with pytest.raises(StageFailedError, match=r"Doing nothing: it ended without .*something"):
-        run_stages(tmp_path, [idle])
-
-
-def test_program_that_is_missing_is_named(tmp_path):
-    missing = Stage("missing", "Calling", [["no-such-program"]], "something")
-    with pytest.raises(StageFailedError, match="Calling: no-such-program can't be started"):
-        run_stages(tmp_path, [missing])
-
-
-def test_configuration_that_ns_train_prints_is_left_out():
-    printed = [
-        "Using --data",
-        "─" * 30 + " Config " + "─" * 30,
-        "TrainerConfig(",
-        "",
-        ")",
-        "─" * 60,
-        "",
-        "Saving config",
-    ]
-    assert list(without_config(printed)) == ["Using --data", "Saving config"]
-
-
-def test_silent_command_is_said_to_be_running(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(_stages, "SILENCE", 0.2)
-    run_command(["python", "-c", "import time; time.sleep(1); print('awake')"], "Sleeping")
-    lines = [line.split(maxsplit=1)[1] for line in capsys.readouterr().out.splitlines()]
-    assert lines[1:].count("still running …") >= 2
-    assert lines[-1] == "awake"
 
 
 def test_newest_run_is_the_one_configured_last(tmp_path):

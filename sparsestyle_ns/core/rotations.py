@@ -42,9 +42,7 @@ class Similarity(NamedTuple):
         return torch.cat([axes, positions[..., None]], dim=-1)
 
 
-def similarity_between(
-    poses: Float[Tensor, "cameras 3 4"], others: Float[Tensor, "cameras 3 4"]
-) -> Similarity:
+def similarity_between(poses: Float[Tensor, "cameras 3 4"], others: Float[Tensor, "cameras 3 4"]) -> Similarity:
     """The similarity that lays camera poses over others of the same cameras.
 
     Its rotation is the mean of those between the cameras' axes, which few positions, often on a line, don't settle;

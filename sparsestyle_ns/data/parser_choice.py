@@ -20,6 +20,12 @@ def _marker_of(folder: Path) -> Optional[str]:
     return next((marker for marker in MARKERS if (folder / marker).is_file()), None)
 
 
+def parser_name(folder: Path) -> Optional[str]:
+    """The dataparser that a scene's files tell of; None where there is none."""
+    marker = _marker_of(folder)
+    return None if marker is None else MARKERS[marker]
+
+
 def advice(folder: Path, missing: str) -> str:
     """The end of an error message about a missing file: a semicolon and which dataparser to name instead, if any."""
     marker = _marker_of(folder)

@@ -70,9 +70,7 @@ class CameraRefinement(nn.Module):
         """The refined cameras of those that the dataparser gives for the same photos."""
         refined = copy.deepcopy(cameras)
         poses = cameras.camera_to_worlds
-        axes, turn, move, focal = (
-            part.to(poses) for part in (self.axes, self.turn, self.move, self.log_focal.exp())
-        )
+        axes, turn, move, focal = (part.to(poses) for part in (self.axes, self.turn, self.move, self.log_focal.exp()))
         positions = poses[..., 3] + self.unit * (axes @ move[..., None]).squeeze(-1)
         refined.camera_to_worlds = torch.cat([axes @ rotation_matrix(turn), positions[..., None]], dim=-1)
         return with_focal(refined, float(focal))

@@ -7,7 +7,6 @@ pose alone is refined on its photo, the scene and the lens as they are. Any figu
 seen the photo.
 """
 
-import math
 from typing import Union
 
 import torch
@@ -59,9 +58,7 @@ def aligned_to_photo(
         segments = model.space.segments(origins, directions)
         edges = even_edges(len(pick), NUM_SAMPLES, device, generator)
         with autocast(device, model.config.precision):
-            rendered = render_coarse(
-                model.field, segments, directions, edges, model.space.unbounded, model.background
-            )
+            rendered = render_coarse(model.field, segments, directions, edges, model.space.unbounded, model.background)
         loss = reconstruction_loss(rendered.rgb, photo[pick])
         for part, gradient in zip(learned, torch.autograd.grad(loss, learned), strict=True):
             part.grad = gradient

@@ -100,7 +100,7 @@ class CoarseFewShotModel(SceneModel):
             self.grid = DensityGrid(self.config.grid_resolution).to(next(self.field.parameters()).device)
 
     def get_param_groups(self) -> Dict[str, List[Parameter]]:
-        """The matrices of hidden layers; cameras where they are learned; and all else, with exposures where they are."""
+        """The matrices of hidden layers, and all else; where they are learned, exposures with that, and cameras."""
         exposure = [] if self.exposure is None else list(self.exposure.parameters())
         matrices = self.field.hidden_matrices()
         names = {id(matrix) for matrix in matrices}

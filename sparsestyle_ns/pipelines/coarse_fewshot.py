@@ -137,7 +137,7 @@ class CoarseFewShotPipeline(CheckedPipeline):
         return outputs, losses, metrics
 
     def _reprojection_loss(self) -> Float[Tensor, ""]:
-        """How far both photos' rays to matched points miss each other, in pixels; errors over one count by their size."""
+        """How far photos' rays to matched points miss each other, in pixels; errors over one count by their size."""
         manager = self.datamanager
         points = torch.arange(len(manager.matched) // 2, device=self.device)
         errors = reprojection_errors(*manager.matched_pairs(points), 0.0)

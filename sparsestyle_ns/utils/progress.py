@@ -7,6 +7,7 @@ together, the first shows them. A process that was started by another one tells 
 import json
 import math
 import os
+import re
 import threading
 import time
 from contextlib import contextmanager, suppress
@@ -104,6 +105,11 @@ class Bar:
         if task.visible and task.finished and (task.finished_time or 0.0) >= WORTH_A_LINE:
             done = task.completed - task.fields["first"]
             say(f"{task.description}: {done:.0f}{self._unit} in {duration(task.finished_time)}")
+
+
+def is_progress_line(line: str) -> bool:
+    """Whether a line of a log is one of those by which `Bar.reach` says how far work is."""
+    return re.match(r".+: \d+ of \d+.* \(\d+%\)", line) is not None
 
 
 @contextmanager
