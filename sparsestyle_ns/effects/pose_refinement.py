@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 
 from sparsestyle_ns.core.camera_paths import meeting_point
 from sparsestyle_ns.core.rotations import rotation_matrix, similarity_between
-from sparsestyle_ns.data.scene_info import scene_info
+from sparsestyle_ns.data.scene_info import NDC, scene_info
 from sparsestyle_ns.effects.decisions import Decisions, Measurement
 from sparsestyle_ns.effects.scene import Scene
 
@@ -104,16 +104,20 @@ def with_focal(cameras: Cameras, factor: float) -> Cameras:
     return cameras
 
 
-def build_camera_refinement(effects: Decisions, cameras: Cameras, near: Optional[float]) -> Optional[CameraRefinement]:
-    """What stage 1 learns of the cameras; None where the effect is off.
+def moving_unit(cameras: Cameras, ndc: Optional[NDC]) -> float:
+    """How far the nearest things are, about, in the world: a camera that moves by this moves pictures by a radian.
 
-    Args:
-        near: how far the nearest things are, in the world; None: half as far as the point that all cameras look at.
+    In NDC the distance of the near plane, else half that of the point that all cameras look at.
     """
+    if ndc is not None:
+        return ndc.near
+    poses = cameras.camera_to_worlds
+    return 0.5 * float((poses[..., 3] - meeting_point(poses)).norm(dim=-1).median())
+
+
+def build_camera_refinement(effects: Decisions, cameras: Cameras, ndc: Optional[NDC]) -> Optional[CameraRefinement]:
+    """What stage 1 learns of the cameras; None where the effect is off. Fisheyes keep their focal length."""
     if not effects.on("pose_refinement"):
         return None
-    poses = cameras.camera_to_worlds
-    if near is None:
-        near = 0.5 * float((poses[..., 3] - meeting_point(poses)).norm(dim=-1).median())
     is_perspective = bool((cameras.camera_type == CameraType.PERSPECTIVE.value).all())
-    return CameraRefinement(poses, near, has_focal=is_perspective)
+    return CameraRefinement(cameras.camera_to_worlds, moving_unit(cameras, ndc), has_focal=is_perspective)

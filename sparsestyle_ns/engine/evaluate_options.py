@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated, Optional, Tuple
 
 import tyro
 
@@ -27,17 +27,27 @@ class EvaluateOptions(CommandOptions):
     """JSON file to write, in the layout of ns-eval; left out, evaluation.json in the run's folder."""
     style_image: Optional[Path] = None
     """Painting to measure a stylised run against, if not the one it was made with; needs --output-path."""
+    known_scene: Optional[Path] = None
+    """A scene with known poses, of a run whose poses were estimated: its held-out views are measured, which its
+    --known-views place in the run's world, and each is then aligned to its photo; needs --output-path."""
+    known_views: Optional[Tuple[int, ...]] = None
+    """Of that scene, the numbers of the photos that the run was trained on, in the run's order."""
     baked: bool = False
     """Also measure how close a stylised run's baked renders are to exact ones (PSNR in dB)."""
 
     def check(self) -> None:
         """Makes sure that there is such a run, and that the report can be written."""
+        if (self.known_scene is None) != (self.known_views is None):
+            raise InputError(
+                "--known-scene and --known-views go together: a scene, and which of its photos are the run's."
+            )
         needs_style = self.baked or self.style_image is not None
         config = find_config(self.run, STYLE_METHOD if needs_style else "")
         if self.output_path is None:
-            if self.style_image is not None:
+            if self.style_image is not None or self.known_scene is not None:
                 raise InputError(
-                    f"{REPORT_FILE} in the run's folder is for its own painting; name a file with --output-path."
+                    f"{REPORT_FILE} in the run's folder is for its own painting and scene; name a file with "
+                    "--output-path."
                 )
             self.output_path = config.parent / REPORT_FILE
         prepare_output(self.output_path, "The report", "report.json")  # measuring takes minutes

@@ -1,13 +1,17 @@
 """Runs loaded from disk, wherever they lie now, and measured."""
 
 from pathlib import Path
-from typing import NamedTuple, Optional
+from typing import NamedTuple, Optional, Tuple
 
+from sparsestyle_ns.data.parser_choice import parse_dataparser
+from sparsestyle_ns.data.photos import PhotoDataset
+from sparsestyle_ns.effects.pose_refinement import carried_along
 from sparsestyle_ns.engine.evaluate_options import EvaluateOptions
 from sparsestyle_ns.engine.hints import after_evaluation, finish
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.evaluation.held_out import HeldOutReport
 from sparsestyle_ns.evaluation.tables import report_tables
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, FewShotDataManagerConfig
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import find_config
@@ -52,17 +56,53 @@ def evaluate(options: EvaluateOptions) -> None:
     if options.style_image is not None:
         Painting.read(options.style_image)
     config = find_config(options.run)
-    report = evaluate_run(config, options.output_path, options.style_image, options.baked)
+    known = None if options.known_scene is None else (options.known_scene, options.known_views)
+    report = evaluate_run(config, options.output_path, options.style_image, options.baked, known)
     for table in report_tables(report.means, len(report.views)):
         table.print()
     finish(options.output_path, after_evaluation(config.parent, stylised="content_ssim" in report.means))
 
 
 def evaluate_run(
-    config_path: Path, output_path: Path, style_image: Optional[Path] = None, baked: bool = False
+    config_path: Path,
+    output_path: Path,
+    style_image: Optional[Path] = None,
+    baked: bool = False,
+    known: Optional[Tuple[Path, Tuple[int, ...]]] = None,
 ) -> HeldOutReport:
-    """Loads a run and writes its `CheckedPipeline.held_out_report`; InputError where it has no checkpoint."""
+    """Loads a run and writes its `CheckedPipeline.held_out_report`; InputError where it has no checkpoint.
+
+    With `known`, a scene and its numbers of the run's photos, of that scene's held-out views (see `known_views`).
+    """
     config, pipeline, step = load_run(config_path)
-    report = pipeline.held_out_report(style_image, baked)
+    views = None if known is None else known_views(pipeline.datamanager, *known)
+    report = pipeline.held_out_report(style_image, baked, views=views)
     report.save(output_path, config.experiment_name, config.method_name, step)
     return report
+
+
+def known_views(manager: FewShotDataManager, scene: Path, view_ids: Tuple[int, ...]) -> PhotoDataset:
+    """Held-out views of a scene with known poses, placed in the world of a run whose poses were estimated.
+
+    By the similarity that lays the known cameras of the run's photos over the run's own, with its focal length.
+
+    Args:
+        manager: the run's.
+        scene: folder of the known scene.
+        view_ids: its numbers of the run's photos, in the run's order.
+
+    Raises:
+        InputError: the scene can't be read, or these aren't as many photos as the run's, or two or more.
+    """
+    count = len(manager.train_dataset)
+    if len(view_ids) != count or count < 2:
+        raise InputError(
+            f"--known-views names {len(view_ids)} photos, and the run was trained on {count}; name each of these, two "
+            "at least."
+        )
+    known: FewShotDataManager = FewShotDataManagerConfig(
+        data=scene, dataparser=parse_dataparser([], scene), view_ids=view_ids, max_image_side=manager.photo_side
+    ).setup(device="cpu", test_mode="test")
+    views, training = known.eval_dataset, known.train_dataset.cameras
+    views.refine = lambda cameras: carried_along(cameras, training, manager.train_dataset.cameras)
+    return views

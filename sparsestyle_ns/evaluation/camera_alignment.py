@@ -41,7 +41,7 @@ def aligned_to_photo(
     By Adam on the squared error of random pixels, at a learning rate that falls to a hundredth.
 
     Args:
-        unit: of moves, in the world, as in `CameraRefinement`.
+        unit: of moves, in the world (`moving_unit`).
     """
     device = model.device
     camera, photo = camera.to(device), photo.to(device).reshape(-1, 3)

@@ -19,6 +19,8 @@ from sparsestyle_ns.core.occupancy import interval_lengths
 from sparsestyle_ns.core.precision import autocast
 from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.volrend import dense_weights, effective_samples, optical_depth
+from sparsestyle_ns.effects.pose_refinement import moving_unit
+from sparsestyle_ns.evaluation.camera_alignment import aligned_to_photo
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID
 from sparsestyle_ns.metrics.consistency import RANGES, PathGeometry
@@ -89,6 +91,7 @@ def evaluate_held_out(
     targets: Optional[StyleTargets] = None,
     baked: bool = False,
     picture_folder: Optional[Path] = None,
+    align: bool = False,
 ) -> HeldOutReport:
     """Evaluates a model in evaluation on views that it hasn't seen, and on the measuring path, all by exact renders.
 
@@ -101,12 +104,16 @@ def evaluate_held_out(
         targets: the painting's features, for a stylised model.
         baked: whether a stylised model's baked renders are held against the exact ones as well (`baked_psnr`, in dB).
         picture_folder: where to save the views as pictures, beside their photos.
+        align: whether each view's camera is first moved to where the coarse field looks most like its photo
+            (`aligned_to_photo`), since it is known no better than cameras that were estimated.
     """
     style = None if isinstance(model, CoarseFewShotModel) else _StyleMeasure(model, targets, baked)
     values, speeds = [], []
     for index in track(range(len(views)), "Held-out views"):
         camera = views.cameras[index : index + 1].to(model.device)
         photo = views[index]["image"][..., :3]
+        if align:
+            camera = aligned_to_photo(model, camera, photo, moving_unit(training_cameras, model.ndc))
         start = time.perf_counter()
         outputs = exact_outputs(model, camera)
         fps = 1.0 / (time.perf_counter() - start)

@@ -104,8 +104,7 @@ def _render_views(pipeline: HierStylePipeline, num_views: int) -> Tuple[List[Vie
         path = dataset.image_filenames[index]
         photo = _photo(originals, index)
         width_height = torch.tensor(photo.shape[1::-1]).view(2, 1, 1)
-        camera = at_size(originals.cameras[index : index + 1], *width_height).to(pipeline.device)
-        camera.distortion_params = dataset.cameras[index : index + 1].distortion_params
+        camera = at_size(dataset.cameras[index : index + 1], *width_height).to(pipeline.device)
         outputs = exact_outputs(pipeline.model, camera)
         target = {"image": torch.from_numpy(photo).to(pipeline.device) / 255.0}
         measured.append(pipeline.model.get_image_metrics_and_images(outputs, target)[0])

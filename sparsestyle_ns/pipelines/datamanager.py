@@ -180,8 +180,12 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
             return
         self._refined_rays = refinement.forward  # no module, which would be part of the state twice
         self.train_dataset.refine = refinement.cameras
-        is_held_out = self.eval_dataset.image_filenames != self.train_dataset.image_filenames
-        self.eval_dataset.refine = self._carried_along if is_held_out else refinement.cameras
+        self.eval_dataset.refine = self._carried_along if self.has_held_out else refinement.cameras
+
+    @property
+    def has_held_out(self) -> bool:
+        """Whether views are evaluated that aren't those trained on."""
+        return self.eval_dataset.image_filenames != self.train_dataset.image_filenames
 
     def _carried_along(self, cameras: Cameras) -> Cameras:
         given, refined = self.train_dataset.given_cameras, self.train_dataset.cameras

@@ -12,6 +12,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from torch.amp import GradScaler
 
+from sparsestyle_ns.data.photos import PhotoDataset
 from sparsestyle_ns.data.scene_info import scene_info
 from sparsestyle_ns.effects.decisions import Decisions, EffectSettings
 from sparsestyle_ns.effects.pose_refinement import build_camera_refinement
@@ -84,7 +85,7 @@ class CheckedPipeline(VanillaPipeline):
             num_train_data=len(dataset),
             effects=self.effects,
             ndc=ndc,
-            refinement=build_camera_refinement(self.effects, dataset.cameras, None if ndc is None else ndc.near),
+            refinement=build_camera_refinement(self.effects, dataset.cameras, ndc),
             device=device,
         ).to(device)
         self.datamanager.refine_cameras(self.model.refinement)
@@ -102,12 +103,18 @@ class CheckedPipeline(VanillaPipeline):
         return None
 
     def held_out_report(
-        self, style_image: Optional[Path] = None, baked: bool = False, picture_folder: Optional[Path] = None
+        self,
+        style_image: Optional[Path] = None,
+        baked: bool = False,
+        picture_folder: Optional[Path] = None,
+        views: Optional[PhotoDataset] = None,
     ) -> HeldOutReport:
-        """What `sparsestyle evaluate` measures; see `evaluate_held_out`."""
-        views, cameras = self.datamanager.eval_dataset, self.datamanager.train_dataset.cameras
-        targets = self.style_targets(style_image)
-        return evaluate_held_out(self.model, views, cameras, targets, baked, picture_folder)
+        """What `sparsestyle evaluate` measures, on the scene's held-out views or others; see `evaluate_held_out`."""
+        manager = self.datamanager
+        cameras, targets = manager.train_dataset.cameras, self.style_targets(style_image)
+        align = self.model.refinement is not None and manager.has_held_out
+        align, views = align or views is not None, views or manager.eval_dataset
+        return evaluate_held_out(self.model, views, cameras, targets, baked, picture_folder, align)
 
     @exit_on_input_error
     def get_average_eval_image_metrics(
