@@ -92,8 +92,8 @@ class Decisions:
         return {item.name: item for item in self.items}[name]
 
     def on(self, name: str) -> bool:
-        """Whether an effect is simulated."""
-        return self[name].on
+        """Whether an effect is simulated; one that these decisions are older than isn't."""
+        return any(item.on for item in self.items if item.name == name)
 
     def replaced(self, decision: Decision) -> "Decisions":
         """The same decisions but one."""

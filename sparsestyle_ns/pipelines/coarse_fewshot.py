@@ -15,6 +15,7 @@ from torch import Tensor
 from sparsestyle_ns.core.camera_paths import unseen_places
 from sparsestyle_ns.core.triangulation import reprojection_errors
 from sparsestyle_ns.effects.registry import decide_again
+from sparsestyle_ns.effects.scene import LONGEST_SIDE
 from sparsestyle_ns.losses.coarse import pooled_features, semantic_loss
 from sparsestyle_ns.losses.stylization import fit_side
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel, CoarseFewShotModelConfig
@@ -137,11 +138,15 @@ class CoarseFewShotPipeline(CheckedPipeline):
         return outputs, losses, metrics
 
     def _reprojection_loss(self) -> Float[Tensor, ""]:
-        """How far photos' rays to matched points miss each other, in pixels; errors over one count by their size."""
+        """How far photos' rays to matched points miss each other, in pixels of the size at which these were matched.
+
+        Errors over a pixel count by their size, smaller ones by their square (Huber).
+        """
         manager = self.datamanager
         points = torch.arange(len(manager.matched) // 2, device=self.device)
         errors = reprojection_errors(*manager.matched_pairs(points), 0.0)
-        pixels = errors * float(manager.train_dataset.given_cameras.fx.mean())
+        cameras = manager.train_dataset.given_cameras
+        pixels = errors * LONGEST_SIDE * float((cameras.fx / torch.maximum(cameras.width, cameras.height)).mean())
         return F.huber_loss(pixels, torch.zeros_like(pixels))
 
     def decide_empty_space(self, step: int) -> None:

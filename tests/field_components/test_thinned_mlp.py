@@ -142,7 +142,33 @@ def test_it_follows_autocast():
         assert gradient.dtype == torch.float32
 
 
-def test_inputs_that_want_a_gradient_are_refused():
+def test_inputs_that_want_a_gradient_get_that_of_the_layers():
     hidden, heads = network()
-    with pytest.raises(ValueError, match="no gradient"):
-        thinned_mlp(points().requires_grad_(), hidden, heads, ALL)
+    found, expected = (
+        torch.autograd.grad(uneven_loss(run(inputs)), inputs)[0]
+        for inputs, run in (
+            (points().requires_grad_(), lambda inputs: thinned_mlp(inputs, hidden, heads, ALL)),
+            (points().requires_grad_(), lambda inputs: by_autograd(inputs, hidden, heads)),
+        )
+    )
+    torch.testing.assert_close(found, expected)
+
+
+def test_inputs_of_points_that_stay_get_their_gradient_weighted_up_and_others_none():
+    hidden, heads = network()
+    inputs = points(3000).requires_grad_()  # so many that those that stay are filled up to a multiple
+
+    def loss(outputs):
+        """To which points matter more or less, but none next to nothing."""
+        share = torch.linspace(0.05, 1.0, len(inputs), dtype=inputs.dtype)[:, None]
+        return sum((share * torch.sin(output)).sum() for output in outputs)
+
+    outputs = by_autograd(inputs, hidden, heads)
+    (exact,) = torch.autograd.grad(loss(outputs), inputs, retain_graph=True)
+    of_outputs = torch.cat(torch.autograd.grad(loss(outputs), outputs), dim=-1)
+    kept, weighted = thin(of_outputs, Thinning(2.0, torch.Generator().manual_seed(7)))
+    assert len(kept) % MULTIPLE == 0 and len(kept.unique()) < len(kept)
+    weights = torch.zeros(len(inputs), dtype=inputs.dtype)
+    weights.index_add_(0, kept, weighted.norm(dim=-1) / of_outputs[kept].norm(dim=-1))
+    found = thinned_mlp(inputs, hidden, heads, Thinning(2.0, torch.Generator().manual_seed(7)))
+    torch.testing.assert_close(torch.autograd.grad(loss(found), inputs)[0], weights[:, None] * exact)
