@@ -47,7 +47,7 @@ class CameraRefinement(nn.Module):
 
     def __init__(self, poses: Float[Tensor, "views 3 4"], unit: float, has_focal: bool = True) -> None:
         super().__init__()
-        self.unit = unit
+        self.unit, self.learns = unit, True
         self.register_buffer("axes", poses[..., :3].float().clone(), persistent=False)
         self.turn = nn.Parameter(torch.zeros(len(poses), 3))
         self.move = nn.Parameter(torch.zeros(len(poses), 3))
@@ -56,7 +56,11 @@ class CameraRefinement(nn.Module):
     def forward(
         self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], views: Int[Tensor, "rays"]
     ) -> Tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
-        """Rays of the photos' pixels, unit directions, as they are by the refined cameras; differentiable."""
+        """Rays of the photos' pixels, unit directions, by the refined cameras; differentiable while these learn."""
+        with torch.set_grad_enabled(torch.is_grad_enabled() and self.learns):
+            return self._rays(origins, directions, views)
+
+    def _rays(self, origins: Tensor, directions: Tensor, views: Tensor) -> Tuple[Tensor, Tensor]:
         turned = self.axes @ rotation_matrix(self.turn)
         # In a camera's own axes; a longer lens spreads rays less.
         own = torch.einsum("nij,ni->nj", self.axes[views], directions)

@@ -71,6 +71,9 @@ class CoarseFewShotModelConfig(SceneModelConfig):
     """Part of a ray, from its start, that counts as close for the occlusion loss."""
     frequency_reveal: float = 0.0
     """Share of the iterations in which the encoding's octaves are revealed one by one (FreeNeRF); 0 is off."""
+    refinement_start: float = 0.25
+    """Share of the iterations after which cameras are learned, where they are: a field that is fog yet would only push
+    them about."""
     seed: int = 42
     """Seed of the jitter of samples; a step's jitter depends on it and the step alone."""
 
@@ -125,12 +128,14 @@ class CoarseFewShotModel(SceneModel):
         self.learns, self._measured = False, None
 
     def update_to_step(self, step: int) -> None:
-        """Sets what depends on the iteration: the jitter and the octaves that are revealed."""
+        """Sets what depends on the iteration: the jitter, the octaves that are revealed, and what is learned."""
         self.step = step
         reveal, levels = self.config.frequency_reveal * self.num_iterations, None
         if self.training and step < reveal:
             levels = revealed_levels(step / reveal, self.config.coarse_field.num_levels)
         self.field.position_encoding.level_weights = levels
+        if self.refinement is not None:
+            self.refinement.learns = step >= self.config.refinement_start * self.num_iterations
 
     def place_samples(self, segments: Segments, num_samples: int, generator: Optional[torch.Generator]) -> Tensor:
         """Borders of samples on rays: where the grid remembers density, or evenly without one."""

@@ -129,7 +129,8 @@ class CoarseFewShotPipeline(CheckedPipeline):
     def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Any], Dict[str, Tensor], Dict[str, Any]]:
         """Outputs, losses and metrics of a batch and, every `semantic_every` iterations, the loss of an unseen view."""
         outputs, losses, metrics = super().get_train_loss_dict(step)
-        if self.model.refinement is not None and self.datamanager.matched is not None:
+        refinement = self.model.refinement
+        if refinement is not None and refinement.learns and self.datamanager.matched is not None:
             losses["reprojection_loss"] = self.config.reprojection_weight * self._reprojection_loss()
         if self.unseen is not None and step % self.config.semantic_every == 0:
             # Which view and which photo depends on the data manager's seed and the step alone.

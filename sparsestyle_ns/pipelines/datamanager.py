@@ -235,6 +235,11 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
             super().setup_eval()
         return super().next_eval(step)
 
+    def next_eval_image(self, step: int) -> Tuple[Cameras, Dict[str, Any]]:
+        """A held-out camera, as refined as it is by now, with its photo."""
+        self.eval_dataloader.cameras = self.eval_dataset.cameras.to(self.device)
+        return super().next_eval_image(step)
+
     def next_train(self, step: int) -> Tuple[RayBundle, Dict[str, Any]]:
         """A batch of random pixels of all training views; the same for the same seed and step.
 

@@ -199,6 +199,7 @@ class Workbench:
         return means
 
     def _figures(self, model: Model, view: int) -> Dict[str, float]:
+        self.manager.refine_cameras(model.refinement)
         outputs = model.get_outputs_for_camera(self.eval_dataset.cameras[view : view + 1].to(self.device))
         if isinstance(model, CoarseFewShotModel):
             figures = image_metrics(outputs["rgb"], self.photos[view])

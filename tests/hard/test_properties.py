@@ -28,7 +28,7 @@ import sparsestyle_ns.losses
 import sparsestyle_ns.rendering
 import sparsestyle_ns.style
 from sparsestyle_ns.core import feature_maps as maps_of
-from sparsestyle_ns.core import ndc, precision, sampling, schedules, sliced
+from sparsestyle_ns.core import ndc, precision, rotations, sampling, schedules, sliced, triangulation
 from sparsestyle_ns.core import occupancy as density_grid
 from sparsestyle_ns.core import spaces as space
 from sparsestyle_ns.core import volrend as compositing
@@ -505,6 +505,52 @@ def test_a_thinned_backward_pass_weights_points_up_and_stays_finite(data, count,
     torch.testing.assert_close(output, head(torch.relu(layer(inputs))))
     (output.clamp(-1e3, 1e3).sum() * 1e-3).backward()
     assert all(torch.isfinite(parameter.grad).all() for parameter in (*layer.parameters(), *head.parameters()))
+
+
+@covers(rotations.rotation_matrix)
+@given(st.data(), COUNTS, FLOATS)
+def test_a_turn_by_any_vector_is_a_rotation(data, count, dtype):
+    vectors = data.draw(tensors((count, 3), -30, 6, signed=True, dtype=dtype)).requires_grad_()
+    turns = rotations.rotation_matrix(vectors)
+    unit = torch.eye(3, dtype=dtype).expand(count, 3, 3)
+    # Angles of up to 1e6 radians have lost as many digits.
+    tolerance = 1e-3 if dtype == torch.float32 else 1e-9
+    torch.testing.assert_close(turns @ turns.mT, unit, atol=tolerance, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(turns), torch.ones(count, dtype=dtype), atol=tolerance, rtol=0)
+    turns.square().sum().backward()
+    assert torch.isfinite(vectors.grad).all()
+
+
+@covers(rotations.similarity_between)
+@given(st.integers(1, 6), SEEDS, st.floats(1e-3, 1e3))
+def test_a_similarity_between_any_cameras_is_one(count, seed, scale):
+    generator = torch.Generator().manual_seed(seed)
+    first, second = (
+        torch.cat([rotations.rotation_matrix(vectors[..., 0]), scale * vectors[..., 1:]], dim=-1)
+        for vectors in torch.randn(2, count, 3, 2, generator=generator, dtype=torch.float64)
+    )
+    found = rotations.similarity_between(first, second)
+    assert found.scale > 0
+    torch.testing.assert_close(found.rotation @ found.rotation.T, torch.eye(3, dtype=torch.float64))
+    torch.testing.assert_close(torch.linalg.det(found.rotation), torch.tensor(1.0, dtype=torch.float64))
+    own = rotations.similarity_between(first, first).of_poses(first)
+    torch.testing.assert_close(own, first, atol=1e-9 * scale, rtol=0)
+
+
+@covers(triangulation.distances_to_meeting, triangulation.reprojection_errors)
+@given(st.data(), COUNTS, FLOATS, SEEDS)
+def test_errors_of_any_two_rays_are_angles_with_a_gradient(data, count, dtype, seed):
+    generator = torch.Generator().manual_seed(seed)
+    origins = data.draw(tensors((2, count, 3), -6, 6, signed=True, dtype=dtype)).requires_grad_()
+    directions = normalize(torch.randn(2, count, 3, generator=generator, dtype=dtype), dim=-1).requires_grad_()
+    distances = triangulation.distances_to_meeting(origins, directions)
+    assert not distances.isnan().any()
+    errors = triangulation.reprojection_errors(origins, directions, 0.0)
+    assert ((errors >= 0) & (errors <= math.pi / 2 + 1e-6)).all()
+    behind = (distances <= 0).any(dim=0)
+    assert (errors[:, behind] == 0).all()
+    errors.sum().backward()
+    assert torch.isfinite(origins.grad).all() and torch.isfinite(directions.grad).all()
 
 
 @covers(tiny_cuda_grid.growth_factor, tiny_cuda_grid.tiny_cuda_levels, tiny_cuda_grid.locate_tiny_cuda_corners)
