@@ -1,11 +1,21 @@
-"""SIFT features of photos (Lowe 2004), which features of two photos look alike, and which photos that links."""
+"""SIFT features of photos (Lowe 2004), which features of two photos look alike, and which photos that links.
+
+The package's one matcher: poses are found, photos judged and depths triangulated by what it says.
+"""
 
 from dataclasses import dataclass
-from typing import Iterable, List, Set, Tuple
+from itertools import combinations
+from typing import Callable, Dict, Iterable, List, Optional, Sequence, Set, Tuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+
+MAX_FEATURES, MIN_CONTRAST, MAX_RATIO = 4000, 0.02, 0.8
+"""Features of a photo, their contrast, and Lowe's ratio; lenient, as the cameras' geometry sorts out wrong matches."""
+
+Pair = Tuple[int, int]
+"""Numbers of two photos, the smaller first."""
 
 
 @dataclass
@@ -19,9 +29,22 @@ class Features:
         return len(self.points)
 
 
-def find_features(grey: UInt8[np.ndarray, "H W"], count: int, min_contrast: float = 0.04) -> Features:
-    """A grey picture's SIFT features: the `count` strongest, of at least this contrast (OpenCV's default: 0.04)."""
-    sift = cv2.SIFT_create(nfeatures=count, contrastThreshold=min_contrast)
+@dataclass
+class PhotoMatches:
+    """Which places in which photos show the same thing, as far as their looks tell.
+
+    Attributes:
+        points: each photo's features: (x, y) in its pixels, the centre of the first at (0, 0).
+        pairs: for two photos, which features match: the one's in the first row, the other's in the second.
+    """
+
+    points: List[Float[np.ndarray, "features 2"]]
+    pairs: Dict[Pair, Int[np.ndarray, "2 matches"]]
+
+
+def find_features(grey: UInt8[np.ndarray, "H W"]) -> Features:
+    """A grey picture's strongest SIFT features, `MAX_FEATURES` at most."""
+    sift = cv2.SIFT_create(nfeatures=MAX_FEATURES, contrastThreshold=MIN_CONTRAST)
     keypoints, descriptors = sift.detectAndCompute(grey, None)
     if not keypoints:
         return Features(np.empty((0, 2)), np.empty((0, 128), np.float32))
@@ -30,7 +53,18 @@ def find_features(grey: UInt8[np.ndarray, "H W"], count: int, min_contrast: floa
     return Features(np.array([keypoint.pt for keypoint in keypoints]), descriptors)
 
 
-def linked_groups(count: int, links: Iterable[Tuple[int, int]]) -> List[Set[int]]:
+def match_photos(
+    features: Sequence[Features],
+    pairs: Optional[Sequence[Pair]] = None,
+    each: Callable[[Sequence[Pair]], Iterable[Pair]] = iter,
+) -> PhotoMatches:
+    """Matches photos' features, of these pairs of photos or of all; `each` may show how far that is."""
+    pairs = list(combinations(range(len(features)), 2)) if pairs is None else pairs
+    found = {pair: np.stack(mutual_matches(*(features[index].descriptors for index in pair))) for pair in each(pairs)}
+    return PhotoMatches([each_photo.points for each_photo in features], found)
+
+
+def linked_groups(count: int, links: Iterable[Pair]) -> List[Set[int]]:
     """Groups of photos, 0 to count − 1, that are linked to each other, directly or by way of others."""
     groups = [{photo} for photo in range(count)]
     for link in links:
@@ -40,7 +74,7 @@ def linked_groups(count: int, links: Iterable[Tuple[int, int]]) -> List[Set[int]
 
 
 def mutual_matches(
-    first: Float[np.ndarray, "features 128"], second: Float[np.ndarray, "others 128"], max_ratio: float
+    first: Float[np.ndarray, "features 128"], second: Float[np.ndarray, "others 128"], max_ratio: float = MAX_RATIO
 ) -> Tuple[Int[np.ndarray, "matches"], Int[np.ndarray, "matches"]]:
     """Places of unit descriptors that are each other's nearest, and clearly nearer than the second nearest.
 

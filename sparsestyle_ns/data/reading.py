@@ -12,9 +12,11 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOu
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from sparsestyle_ns.data.estimated import estimated_cameras
 from sparsestyle_ns.data.parser_choice import advice
 from sparsestyle_ns.data.photos import open_photo
 from sparsestyle_ns.data.scene_info import SCENE_INFO, SceneInfo
+from sparsestyle_ns.data.tracks import Tracks
 from sparsestyle_ns.data.view_selection import BLENDER_VIEWS
 from sparsestyle_ns.utils.errors import InputError
 
@@ -54,10 +56,12 @@ def read_scene(parser: DataParser, split: str = "train") -> DataparserOutputs:
             "its files, or choose the dataparser that they were made for."
         ) from error
     _check_cameras(outputs)
-    if SCENE_INFO in outputs.metadata:
-        return outputs
     standard_views = BLENDER_VIEWS if isinstance(config, BlenderDataParserConfig) else None
-    info = SceneInfo(tuple(range(len(outputs.image_filenames))), standard_views=standard_views)
+    usual = SceneInfo(tuple(range(len(outputs.image_filenames))), standard_views=standard_views)
+    info = outputs.metadata.get(SCENE_INFO, usual)
+    folder = config.data if config.data.is_dir() else config.data.parent
+    if estimated_cameras(folder) is not None:
+        info = replace(info, poses_estimated=True, tracks=Tracks.find(folder))
     return replace(outputs, metadata={**outputs.metadata, SCENE_INFO: info})
 
 

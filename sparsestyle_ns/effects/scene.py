@@ -75,7 +75,9 @@ class Scene:
     def matches(self) -> PointMatches:
         """Points that are seen in two of `matched_views`; photos are numbered by their places there."""
         chosen = self.matched_views
-        return match_points([self.photos[index] for index in chosen], self.cameras[torch.tensor(chosen)])
+        names = [self.outputs.image_filenames[index].name for index in chosen]
+        cameras, tracks = self.cameras[torch.tensor(chosen)], scene_info(self.outputs).tracks
+        return match_points([self.photos[index] for index in chosen], cameras, names, tracks)
 
     @property
     def matched_views(self) -> List[int]:

@@ -1,6 +1,6 @@
 """Reading photos as cameras and phones store them, and bringing them to one size."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import List, Sequence, Tuple
 
@@ -27,12 +27,14 @@ class Photo:
         image: RGB, or RGBA where any pixels are transparent.
         orientation: EXIF's, from 1 (upright) to 8; 1 where it says nothing.
         upright: whether `image` was turned by that; else it has the pixels as they are stored.
+        exif: all that EXIF says.
     """
 
     path: Path
     image: Image.Image
     orientation: int = 1
     upright: bool = True
+    exif: Image.Exif = field(default_factory=Image.Exif)
 
 
 @dataclass(frozen=True)
@@ -81,11 +83,13 @@ def read_photo(path: Path, upright: bool = True) -> Photo:
     try:
         with Image.open(path) as image:
             image.load()  # by which Pillow turns a TIFF upright, and forgets the orientation
-            orientation = image.getexif().get(ExifTags.Base.Orientation)
+            exif = image.getexif()
+            exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
+            orientation = exif.get(ExifTags.Base.Orientation)
             turned = ImageOps.exif_transpose(image) if upright else image
             transparent = turned.has_transparency_data and turned.convert("RGBA").getchannel("A").getextrema()[0] < 255
             pixels = turned.convert("RGBA" if transparent else "RGB")
-            return Photo(path, pixels, orientation if orientation in range(2, 9) else 1, upright)
+            return Photo(path, pixels, orientation if orientation in range(2, 9) else 1, upright, exif)
     except UnidentifiedImageError as error:
         raise InputError(
             f"{path} is no image that can be read; save it again as JPEG or PNG, or take it out."
