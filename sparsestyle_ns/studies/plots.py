@@ -36,7 +36,7 @@ def line_plot(
     y_label: str,
     marks: Literal["", "end", "all"] = "",
 ) -> str:
-    """Lines with a legend as SVG: x and y values of each by its name; with dots at their ends, or at all their points."""
+    """Lines with a legend as SVG: x and y values of each by its name; with dots at their ends or everywhere."""
     with _svg() as (cell, svg):
         for name, (x, y) in series.items():
             cell.plot(
