@@ -31,7 +31,7 @@ def test_methods_are_at_full_size_and_drafts_at_half_of_it():
 def test_stage_1_learns_matrices_with_muon_and_all_else_with_adam_both_slower_and_slower(variant):
     config = method_config(f"coarse-fewshot{variant}")
     kinds = {name: type(group["optimizer"]) for name, group in config.optimizers.items()}
-    assert kinds == {"fields": FusedAdamConfig, "hidden_layers": MuonConfig}
+    assert kinds == {"fields": FusedAdamConfig, "hidden_layers": MuonConfig, "cameras": FusedAdamConfig}
     for group in config.optimizers.values():
         assert 0.0 < group["scheduler"].final < 1.0
 
@@ -47,7 +47,7 @@ def test_stage_2_goes_from_half_size_to_the_photos(variant):
 def test_the_papers_stage_1_has_50_000_iterations_of_adam_at_a_constant_rate():
     config = method_config("coarse-fewshot-paper")
     assert config.max_num_iterations == 50_000
-    for name in ("fields", "hidden_layers"):
+    for name in ("fields", "hidden_layers", "cameras"):
         optimizer, scheduler = (config.optimizers[name][part] for part in ("optimizer", "scheduler"))
         assert type(optimizer) is FusedAdamConfig and scheduler is None
         assert (optimizer.lr, optimizer.betas) == (5e-4, (0.9, 0.999))

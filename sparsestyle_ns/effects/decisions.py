@@ -34,7 +34,7 @@ class EffectSettings:
     matched_depth: EffectChoice = "auto"
     """Depth of points that two photos share, found by matching."""
     pose_refinement: EffectChoice = "auto"
-    """Cameras learned with the field: where their poses were estimated from the photos alone."""
+    """Cameras learned with the field: where rays to points that two photos share miss each other."""
     empty_space: EffectChoice = "auto"
     """Empty-space skipping: where enough of space is empty; decided again while stage 1 trains."""
     residual_density: EffectChoice = "auto"

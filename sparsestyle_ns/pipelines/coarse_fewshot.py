@@ -13,9 +13,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sparsestyle_ns.core.camera_paths import unseen_places
-from sparsestyle_ns.core.triangulation import reprojection_errors
+from sparsestyle_ns.effects.pose_refinement import miss_in_pixels
 from sparsestyle_ns.effects.registry import decide_again
-from sparsestyle_ns.effects.scene import LONGEST_SIDE
 from sparsestyle_ns.losses.coarse import pooled_features, semantic_loss
 from sparsestyle_ns.losses.stylization import fit_side
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel, CoarseFewShotModelConfig
@@ -145,9 +144,7 @@ class CoarseFewShotPipeline(CheckedPipeline):
         """
         manager = self.datamanager
         points = torch.arange(len(manager.matched) // 2, device=self.device)
-        errors = reprojection_errors(*manager.matched_pairs(points), 0.0)
-        cameras = manager.train_dataset.given_cameras
-        pixels = errors * LONGEST_SIDE * float((cameras.fx / torch.maximum(cameras.width, cameras.height)).mean())
+        pixels = miss_in_pixels(*manager.matched_pairs(points), manager.train_dataset.given_cameras)
         return F.huber_loss(pixels, torch.zeros_like(pixels))
 
     def decide_empty_space(self, step: int) -> None:

@@ -1,18 +1,30 @@
 """Cameras that are learned with the field: their rays, where they go from stage 1 to all else, and what is measured."""
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from conftest import TINY, TINY_STYLE, ns_train, only_run
 from nerfstudio.cameras.cameras import Cameras
+from scipy.spatial.transform import Rotation
 
 from sparsestyle_ns.core.rotations import rotation_matrix
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.data.scene_info import NDC, SceneInfo
+from sparsestyle_ns.data.reading import read_scene
+from sparsestyle_ns.data.scene_info import NDC
 from sparsestyle_ns.effects.decisions import EffectSettings
-from sparsestyle_ns.effects.pose_refinement import CameraRefinement, carried_along, measure_pose_refinement, moving_unit
+from sparsestyle_ns.effects.pose_refinement import (
+    MAX_MISS,
+    CameraRefinement,
+    carried_along,
+    measure_pose_refinement,
+    moving_unit,
+)
+from sparsestyle_ns.effects.registry import decide
+from sparsestyle_ns.effects.scene import Scene
 from sparsestyle_ns.engine.loading import known_views, load_run
 from sparsestyle_ns.evaluation.camera_alignment import aligned_to_photo
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
@@ -107,11 +119,41 @@ def test_other_cameras_of_the_scene_are_carried_along():
     torch.testing.assert_close(moved.fx, 1.2 * other.fx)
 
 
-def test_it_is_on_where_poses_were_estimated():
-    for estimated in (False, True):
-        info = SceneInfo((0, 1, 2), poses_estimated=estimated)
-        found = measure_pose_refinement(SimpleNamespace(outputs=SimpleNamespace(metadata={"scene_info": info})))
-        assert found.on == estimated
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three forward-facing photos, 252 × 189 pixels, whose cameras are known exactly."""
+    import make_sample_scene
+
+    folder = tmp_path_factory.mktemp("photos")
+    make_sample_scene.main([str(folder), "--layout", "llff", "--width", "252", "--num-views", "3"])
+    return folder / "llff"
+
+
+def turned(scene: Path, folder: Path, degrees: float) -> Path:
+    """A scene whose cameras are wrongly turned by so much, each about another axis."""
+    shutil.copytree(scene, folder)
+    rows = np.load(folder / "poses_bounds.npy")
+    matrices = rows[:, :15].reshape(-1, 3, 5)
+    for matrix, axis in zip(matrices, np.eye(3), strict=True):
+        matrix[:, :3] = Rotation.from_rotvec(np.radians(degrees) * axis).as_matrix() @ matrix[:, :3]
+    np.save(folder / "poses_bounds.npy", np.c_[matrices.reshape(-1, 15), rows[:, 15:]])
+    return folder
+
+
+def scene_of(folder: Path) -> Scene:
+    return Scene(read_scene(LLFFDataParserConfig(data=folder).setup()))
+
+
+@pytest.mark.parametrize(("degrees", "on"), [(0.0, False), (0.2, True), (0.4, True)])
+def test_it_is_on_where_rays_to_matched_points_miss_each_other(photos, tmp_path, degrees, on):
+    found = measure_pose_refinement(scene_of(turned(photos, tmp_path / "scene", degrees)))
+    assert found.on == on and (found.value >= MAX_MISS) == on
+    assert "matched points miss each other" in found.reason and "known" in found.reason
+
+
+def test_where_nothing_matches_it_cannot_be_measured_and_is_off(llff_scene):
+    found = measure_pose_refinement(scene_of(llff_scene))
+    assert (found.on, found.value) == (False, None) and "not measurable" in found.reason
 
 
 REFINED = ["--pipeline.effects.pose-refinement", "on"]
@@ -167,29 +209,22 @@ def test_what_is_off_has_no_cameras_to_learn(runs):
     assert dataset.cameras is dataset.given_cameras
 
 
-def test_depths_of_matched_points_follow_the_refined_cameras(tmp_path):
-    import make_sample_scene
-
-    make_sample_scene.main([str(tmp_path), "--layout", "llff", "--width", "126", "--num-views", "3"])
-    data = tmp_path / "llff"
-    manager = FewShotDataManagerConfig(data=data, dataparser=LLFFDataParserConfig()).setup(device="cpu")
-    from sparsestyle_ns.effects.registry import decide
-
+def test_depths_of_matched_points_follow_the_refined_cameras(photos):
+    manager = FewShotDataManagerConfig(data=photos, dataparser=LLFFDataParserConfig()).setup(device="cpu")
     manager.set_effects(decide(manager.scene, EffectSettings(matched_depth="on", pose_refinement="on")))
-    refinement = CameraRefinement(manager.train_dataset.cameras.camera_to_worlds, 1.0)
+    given = manager.train_dataset.cameras.camera_to_worlds
     before = manager.next_train(0)[0].metadata["matched_distance"]
+    refinement = CameraRefinement(given, 1.0)
     manager.refine_cameras(refinement)
     same = manager.next_train(0)[0].metadata["matched_distance"]
     torch.testing.assert_close(same, before, rtol=1e-3, atol=0)  # rays that all but meet, in single precision
-    with torch.no_grad():
-        refinement.move *= 0.0
-        refinement.move += (
-            -0.5 * (manager.train_dataset.given_cameras.camera_to_worlds[..., 3:].mT.squeeze(1)) @ (torch.eye(3))
-        )
+    with torch.no_grad():  # all cameras come half way to their middle, so that what they see is half as far
+        to_middle = 0.5 * (given[..., 3].mean(dim=0) - given[..., 3])
+        refinement.move.copy_(torch.einsum("nij,ni->nj", given[..., :3], to_middle))
     bundle, _ = manager.next_train(0)
+    torch.testing.assert_close(bundle.metadata["matched_distance"], 0.5 * before, rtol=1e-2, atol=0)
+    assert not bundle.metadata["matched_distance"].requires_grad
     assert bundle.origins.requires_grad and bundle.directions.requires_grad
-    known = bundle.metadata["matched_distance"]
-    assert not known.requires_grad and not torch.allclose(known, before, rtol=0.05)
 
 
 def test_held_out_views_of_a_known_scene_stand_where_the_runs_photos_say(refined_runs, llff_scene):
