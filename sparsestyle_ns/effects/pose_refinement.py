@@ -5,13 +5,12 @@ that two photos share. Poses that bundle adjustment found in many such points ca
 """
 
 import copy
-from typing import List, Optional, Tuple
+from typing import Optional, Tuple
 
 import torch
 from jaxtyping import Float, Int
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
-from torch.nn.functional import normalize
 
 from sparsestyle_ns.core.camera_paths import meeting_point
 from sparsestyle_ns.core.rotations import rotation_matrix, similarity_between
@@ -50,81 +49,64 @@ def miss_in_pixels(
 
 
 class CameraRefinement(nn.Module):
-    """Where each photo was taken, as a change of what the dataparser says, and one factor of all focal lengths.
+    """Where each photo was taken, as a change of what the dataparser says; none at 0.
 
-    A camera turns and moves along its own axes (right, up, back): R exp(ω), o + u R t. The focal length changes a ray's
-    slope against its camera's axis. All three change nothing at 0.
+    A camera turns and moves along its own axes (right, up, back): R exp(ω), o + u R t. Focal lengths stay as they are:
+    in forward-facing scenes the depth of everything makes up for them (docs/method.md).
 
     Args:
         poses: camera-to-world, as the dataparser has them.
-        unit: u, in the world: how far the nearest things are, about, so that turns in radians and moves in units change
-            a picture alike.
-        has_focal: whether the focal length is learned.
+        unit: u, in the world, such that turns in radians and moves in units change a picture alike (`moving_unit`).
     """
 
     axes: Float[Tensor, "views 3 3"]
 
-    def __init__(self, poses: Float[Tensor, "views 3 4"], unit: float, has_focal: bool = True) -> None:
+    def __init__(self, poses: Float[Tensor, "views 3 4"], unit: float) -> None:
         super().__init__()
         self.unit, self.learns = unit, True
         self.register_buffer("axes", poses[..., :3].float().clone(), persistent=False)
         self.turn = nn.Parameter(torch.zeros(len(poses), 3))
         self.move = nn.Parameter(torch.zeros(len(poses), 3))
-        self.log_focal = nn.Parameter(torch.zeros(()), requires_grad=has_focal)
 
     def forward(
         self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], views: Int[Tensor, "rays"]
     ) -> Tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
-        """Rays of the photos' pixels, unit directions, by the refined cameras; differentiable while these learn."""
+        """Rays of the photos' pixels by the refined cameras; differentiable while these learn."""
         with torch.set_grad_enabled(torch.is_grad_enabled() and self.learns):
-            return self._rays(origins, directions, views)
+            turned, moved = self._changed_axes()
+            turns = turned @ torch.linalg.inv(self.axes)  # which files give no better than nearly orthogonal
+            return origins + moved[views], torch.einsum("nij,nj->ni", turns[views], directions)
 
-    def _rays(self, origins: Tensor, directions: Tensor, views: Tensor) -> Tuple[Tensor, Tensor]:
+    def _changed_axes(self) -> Tuple[Float[Tensor, "views 3 3"], Float[Tensor, "views 3"]]:
+        """The cameras' axes as they are turned, and how far they moved, in the world."""
         turned = self.axes @ rotation_matrix(self.turn)
-        # In a camera's own axes; a longer lens spreads rays less.
-        own = torch.einsum("nij,ni->nj", self.axes[views], directions)
-        own = torch.cat([own[:, :2], own[:, 2:] * self.log_focal.exp()], dim=-1)
-        directions = normalize(torch.einsum("nij,nj->ni", turned[views], own), dim=-1)
-        moves = self.unit * (self.axes @ self.move[..., None]).squeeze(-1)
-        return origins + moves[views], directions
+        return turned, self.unit * torch.einsum("nij,nj->ni", self.axes, self.move)
 
     @torch.no_grad()
     def cameras(self, cameras: Cameras) -> Cameras:
         """The refined cameras of those that the dataparser gives for the same photos."""
+        turned, moved = (part.to(cameras.camera_to_worlds) for part in self._changed_axes())
         refined = copy.deepcopy(cameras)
-        poses = cameras.camera_to_worlds
-        axes, turn, move, focal = (part.to(poses) for part in (self.axes, self.turn, self.move, self.log_focal.exp()))
-        positions = poses[..., 3] + self.unit * (axes @ move[..., None]).squeeze(-1)
-        refined.camera_to_worlds = torch.cat([axes @ rotation_matrix(turn), positions[..., None]], dim=-1)
-        return with_focal(refined, float(focal))
-
-    def learned(self) -> List[nn.Parameter]:
-        """What an optimiser is to learn."""
-        return [part for part in self.parameters() if part.requires_grad]
-
-    @torch.no_grad()
-    def change(self) -> Tuple[float, float, float]:
-        """The largest turn in degrees, the largest move in `unit`, and the factor of the focal length."""
-        turn = float(self.turn.norm(dim=-1).max().rad2deg())
-        return turn, float(self.move.norm(dim=-1).max()), float(self.log_focal.exp())
+        positions = cameras.camera_to_worlds[..., 3] + moved
+        refined.camera_to_worlds = torch.cat([turned, positions[..., None]], dim=-1)
+        return refined
 
 
 def carried_along(cameras: Cameras, given: Cameras, refined: Cameras) -> Cameras:
-    """Cameras of the world of `given` ones in that of the same ones `refined`, by the similarity between these."""
+    """Cameras of the world of `given` ones in that of the same ones `refined`, by the similarity between these.
+
+    Their focal lengths change as those do, for lenses that move each pixel as before.
+    """
     moved = copy.deepcopy(cameras)
     poses = (each.camera_to_worlds.double() for each in (given, refined))
     own = cameras.camera_to_worlds
     moved.camera_to_worlds = similarity_between(*poses).of_poses(own.double()).to(own)
-    return with_focal(moved, float((refined.fx / given.fx).mean()))
-
-
-def with_focal(cameras: Cameras, factor: float) -> Cameras:
-    """The cameras with other focal lengths, for lenses that move each pixel as before; they are changed in place."""
-    cameras.fx, cameras.fy = cameras.fx * factor, cameras.fy * factor
+    factor = float((refined.fx / given.fx).mean())
+    moved.fx, moved.fy = cameras.fx * factor, cameras.fy * factor
     if cameras.distortion_params is not None:
         powers = cameras.distortion_params.new_tensor(DISTORTION_POWERS)
-        cameras.distortion_params = cameras.distortion_params * factor**powers
-    return cameras
+        moved.distortion_params = cameras.distortion_params * factor**powers
+    return moved
 
 
 def moving_unit(cameras: Cameras, ndc: Optional[NDC]) -> float:
@@ -139,8 +121,7 @@ def moving_unit(cameras: Cameras, ndc: Optional[NDC]) -> float:
 
 
 def build_camera_refinement(effects: Decisions, cameras: Cameras, ndc: Optional[NDC]) -> Optional[CameraRefinement]:
-    """What stage 1 learns of the cameras; None where the effect is off. Fisheyes keep their focal length."""
+    """What stage 1 learns of the cameras; None where the effect is off."""
     if not effects.on("pose_refinement"):
         return None
-    is_perspective = bool((cameras.camera_type == CameraType.PERSPECTIVE.value).all())
-    return CameraRefinement(cameras.camera_to_worlds, moving_unit(cameras, ndc), has_focal=is_perspective)
+    return CameraRefinement(cameras.camera_to_worlds, moving_unit(cameras, ndc))

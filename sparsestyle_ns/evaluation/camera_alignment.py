@@ -45,10 +45,10 @@ def aligned_to_photo(
     """
     device = model.device
     camera, photo = camera.to(device), photo.to(device).reshape(-1, 3)
-    refinement = CameraRefinement(camera.camera_to_worlds, unit, has_focal=False).to(device)
+    refinement = CameraRefinement(camera.camera_to_worlds, unit).to(device)
     bundle = camera.generate_rays(camera_indices=0, keep_shape=True).flatten()
     generator = torch.Generator(device=device).manual_seed(0)
-    learned = refinement.learned()
+    learned = list(refinement.parameters())
     optimizer = torch.optim.Adam(learned, lr=learning_rate)
     for step in range(steps):
         optimizer.param_groups[0]["lr"] = learning_rate * 0.01 ** (step / steps)

@@ -109,7 +109,7 @@ class CoarseFewShotModel(SceneModel):
         names = {id(matrix) for matrix in matrices}
         rest = [parameter for parameter in self.field.parameters() if id(parameter) not in names]
         groups = {"fields": [*rest, *exposure], "hidden_layers": matrices}
-        return groups if self.refinement is None else {**groups, "cameras": self.refinement.learned()}
+        return groups if self.refinement is None else {**groups, "cameras": list(self.refinement.parameters())}
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
