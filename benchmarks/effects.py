@@ -44,6 +44,7 @@ STAGE_1: Dict[str, Tuple[str, Tuple[str, ...], Dict[str, str], Dict[str, str]]] 
     "view_color": ("llff", ("--shiny", "0.8"), {"view_color": "on"}, {"view_color": "off"}),
     "exposure": ("llff", ("--exposure", "0.5"), {"exposure": "on"}, {"exposure": "off"}),
     "matched_depth": ("llff", (), {"matched_depth": "on"}, {"matched_depth": "off"}),
+    "pose_refinement": ("llff", (), {"pose_refinement": "on"}, {"pose_refinement": "off"}),
     "empty_space": ("llff", (), {"empty_space": "on"}, {"empty_space": "off"}),
 }
 """By effect: the layout and options of the scene, and the settings with it and without."""
@@ -71,6 +72,8 @@ def config_of(method: str, layout: str, folder: Path, settings: Dict[str, str]) 
     config = copy.deepcopy(method_config(method))
     config.pipeline.datamanager.data, config.pipeline.datamanager.dataparser = folder, PARSERS[layout]()
     config.pipeline.effects = EffectSettings(**settings)
+    if method == COARSE_METHOD:
+        config.pipeline.model.refinement_start = 0.0  # what is timed is an iteration that learns cameras
     return config
 
 

@@ -2,19 +2,24 @@
 
 import copy
 import functools
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Dict, List, Optional, Tuple
 
+import numpy as np
 import pytest
 import torch
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from sparsestyle_ns.core.rotations import similarity_between
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.decisions import EffectSettings
 from sparsestyle_ns.effects.registry import decide
+from sparsestyle_ns.engine.loading import known_views
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.metrics.image import psnr
@@ -171,6 +176,33 @@ def test_with_the_depth_of_matched_points_three_photos_say_more_about_other_view
         held_out_psnr(folder, "llff", 300, {"matched_depth": choice}, num_views=3) for choice in ("on", "off")
     )
     assert with_it > without
+
+
+@pytest.mark.slow
+def test_cameras_that_are_off_come_nearer_to_where_they_were_and_views_gain(scenes, tmp_path):
+    known = scenes("llff", "--width", "126")
+    rows, axes = np.load(known / "poses_bounds.npy"), np.random.default_rng(0).normal(size=(16, 3))
+    turns = Rotation.from_rotvec(np.radians(0.5) * axes / np.linalg.norm(axes, axis=-1, keepdims=True)).as_matrix()
+    matrices = rows[:, :15].reshape(-1, 3, 5)
+    matrices[..., :3] = turns @ matrices[..., :3]
+    shutil.copytree(known, tmp_path / "off")
+    np.save(tmp_path / "off" / "poses_bounds.npy", np.c_[matrices.reshape(-1, 15), rows[:, 15:]])
+    exact = LLFFDataParserConfig(data=known).setup().get_dataparser_outputs("train").cameras.camera_to_worlds
+    errors, quality = {}, {}
+    for choice in ("on", "off"):
+        effects = {"pose_refinement": choice, "matched_depth": "on"}
+        pipeline = trained_coarse(tmp_path / "off", "llff", 300, effects)
+        manager = pipeline.datamanager
+        found = manager.train_dataset.cameras.camera_to_worlds
+        moved = similarity_between(exact.double(), found.double()).of_poses(exact.double())
+        turned = moved[..., :3].mT @ found[..., :3].double()
+        cosine = 0.5 * (turned.diagonal(dim1=-2, dim2=-1).sum(dim=-1) - 1.0)
+        errors[choice] = float(cosine.clamp(-1.0, 1.0).acos().rad2deg().mean())
+        views = known_views(manager, known, manager.train_dataset.metadata["scene_info"].view_ids)
+        quality[choice] = pipeline.held_out_report(views=views).means["psnr"]
+    print(f"degrees off: {errors}, held-out PSNR: {quality}")
+    assert errors["on"] < 0.7 * errors["off"]
+    assert quality["on"] > quality["off"]
 
 
 @pytest.mark.slow
