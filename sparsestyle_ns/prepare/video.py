@@ -1,6 +1,7 @@
 """Which frames of a video a scene is made of: sharp ones, with equal moves of the camera between them."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import List, Optional
 
@@ -22,7 +23,8 @@ COMPARED_WIDTH = 480
 """Pixels across at which frames are compared."""
 MOST_FRAMES = 8
 SMALLEST_MOVE, LARGEST_MOVE = 0.02, 0.2
-"""What is seen moves by between two frames, in widths of the picture: less is no other place, more overlaps too little."""
+"""How far what is seen moves between two frames, in widths of the picture: less is no other place, more overlaps too
+little."""
 MIN_MATCHES = 20
 
 
@@ -112,7 +114,7 @@ def _small(pixels: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:
 def _moves(frames: List[_Frame]) -> Float[np.ndarray, "gaps"]:
     """How far what is seen moves from each frame to the next, in widths."""
     features = [find_features(_small(frame.pixels[..., ::-1])) for frame in track(frames, "Looking at frames")]
-    return np.array([_move(first, second) for first, second in zip(features[:-1], features[1:], strict=True)])
+    return np.array([_move(first, second) for first, second in pairwise(features)])
 
 
 def _move(first: Features, second: Features) -> float:
