@@ -16,6 +16,7 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
 from sparsestyle_ns.data.features import Features, Pair, PhotoMatches, find_features, linked_groups, mutual_matches
+from sparsestyle_ns.prepare.framing import MIN_PHOTOS
 from sparsestyle_ns.utils.progress import track
 
 COMPARED_SIDE = 1000
@@ -41,8 +42,10 @@ REPEATED = 0.6
 """Share of a photo's features that look like another one of it, from which on its texture repeats itself: bricks and
 tiles have 0.8 and more, other photos at most 0.25."""
 TURNED = 0.06
-"""How far a homography may be from a mere turn of the camera, by the best focal length: of turns 0.02 to 0.05, of a wall
-0.15 and more."""
+"""How far a homography may be from a mere turn of the camera, by the best focal length: of turns 0.02 to 0.05, of a
+wall 0.15 and more."""
+AMBIGUOUS = 0.75
+"""Share of the matches that agree on a geometry, below which matches of a repeated pattern aren't believed."""
 
 
 @dataclass
@@ -122,7 +125,7 @@ def compare(images: Sequence[Image.Image], names: Sequence[str]) -> Comparison:
 
 def findings(seen: Comparison) -> List[str]:
     """What is wrong with compared photos, a sentence each; empty where nothing is."""
-    return [*_faint(seen), *unlinked(seen), *_of_moves(seen), *_repeating(seen)]
+    return [*_faint(seen), *unlinked(seen), *_of_moves(seen), *repeating(seen)]
 
 
 def shrink(image: Image.Image) -> UInt8[np.ndarray, "H W"]:
@@ -219,7 +222,8 @@ def unlinked(seen: Comparison) -> List[str]:
     return sentences
 
 
-def _repeating(seen: Comparison) -> List[str]:
+def repeating(seen: Comparison) -> List[str]:
+    """Which photos show one pattern again and again, in a sentence, if any do."""
     names = [name for name, found in zip(seen.names, seen.features, strict=True) if repeated_share(found) > REPEATED]
     if not names:
         return []
@@ -228,6 +232,15 @@ def _repeating(seen: Comparison) -> List[str]:
         "in which something is there only once, a foot's length from each other, the next one beside where "
         f"{names[0]} was taken."
     ]
+
+
+def hopeless(seen: Comparison) -> bool:
+    """Whether photos' matches can't tell where three of them were taken."""
+    links = [link for link in seen.links.values() if link.linked]
+    if len(seen.groups()[0]) < MIN_PHOTOS or no_depth(seen):
+        return True
+    believed = sum(link.agreeing for link in links) >= AMBIGUOUS * sum(link.matched.shape[1] for link in links)
+    return not believed and bool(repeating(seen))
 
 
 def next_photo(seen: Comparison, group: Set[int]) -> str:

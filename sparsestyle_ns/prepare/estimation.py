@@ -13,8 +13,8 @@ from sparsestyle_ns.core.camera_paths import is_forward_facing
 from sparsestyle_ns.data.estimated import POSES_ESTIMATED, TRANSFORMS
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.data.tracks import Tracks
-from sparsestyle_ns.prepare.diagnosis import Comparison, findings, left_out, no_depth
-from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, Photo
+from sparsestyle_ns.prepare.diagnosis import Comparison, findings, hopeless, left_out
+from sparsestyle_ns.prepare.framing import Framing, Photo
 from sparsestyle_ns.prepare.lenses import shared_lenses
 from sparsestyle_ns.prepare.poses import POSES_BOUNDS
 from sparsestyle_ns.prepare.reconstruction import Reconstruction, num_steps, reconstruct
@@ -115,7 +115,7 @@ def estimate_poses(photos: Sequence[Photo], framings: Sequence[Framing], seen: C
         InputError: that can't be told of three photos; it says why, and which photo to take next.
     """
     reasons = findings(seen)
-    if len(seen.groups()[0]) < MIN_PHOTOS or no_depth(seen):
+    if hopeless(seen):
         raise InputError(f"Where the photos were taken can't be told. {' '.join(reasons)}")
     lenses, lens_of = shared_lenses([(photo.exif, photo.image.size) for photo in photos])
     height, width = seen.greys[0].shape

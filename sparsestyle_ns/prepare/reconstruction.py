@@ -31,8 +31,8 @@ MAX_ERROR = 2.0
 MIN_ANGLE = 1.0
 """Degrees between the outermost rays to a point, in the median, below which the camera hardly moved."""
 MIN_ZOOM, MIN_ZOOM_GAIN = 1.2, 0.25
-"""Factor between focal lengths of photos from which on they may be zoomed; and the share by which focal lengths of their
-own must lower the error, for that to be believed. Zoomed photos lowered it by more than half."""
+"""Factor between focal lengths of photos from which on they may be zoomed; and the share by which focal lengths of
+their own must lower the error, for that to be believed. Zoomed photos lowered it by more than half."""
 MIN_GAIN = 0.05
 """Share by which a lens's distortion must lower the squared error to be believed."""
 CORRELATED = 8.0
@@ -119,7 +119,7 @@ def reconstruct(
     step()
     settled = _settle_focals(best, [longer * lens.focal for lens in lenses], [lens.spread for lens in lenses])
     step()
-    return _checked(_read(settled))
+    return None if settled is None else _checked(_read(settled))
 
 
 def _checked(found: Reconstruction) -> Optional[Reconstruction]:
@@ -308,8 +308,8 @@ def _distorted_where_it_matters(model: pycolmap.Reconstruction) -> pycolmap.Reco
 
 def _settle_focals(
     model: pycolmap.Reconstruction, usual: Sequence[float], spreads: Sequence[float]
-) -> pycolmap.Reconstruction:
-    """The model with the most probable focal lengths, by the photos and by what lenses usually have.
+) -> Optional[pycolmap.Reconstruction]:
+    """The model with the most probable focal lengths, by the photos and by what lenses usually have; None for no sense.
 
     Where the photos say little, as of small moves, the latter weighs more.
     """
@@ -324,7 +324,7 @@ def _settle_focals(
 
     values = {shift: improbability(STEP * shift)[0] for shift in (-1, 0, 1)}
     if not np.isfinite(list(values.values())).all():
-        return model
+        return None
     while (lowest := min(values, key=values.get)) in (min(values), max(values)) and abs(lowest) < STEPS:
         beyond = lowest + (1 if lowest > 0 else -1)
         values[beyond] = improbability(STEP * beyond)[0]

@@ -22,9 +22,9 @@ WINDOWS, LOOKED_AT = 32, 4
 COMPARED_WIDTH = 480
 """Pixels across at which frames are compared."""
 MOST_FRAMES = 8
-SMALLEST_MOVE, LARGEST_MOVE = 0.02, 0.2
-"""How far what is seen moves between two frames, in widths of the picture: less is no other place, more overlaps too
-little."""
+SMALLEST_MOVE, USUAL_MOVE, LARGEST_MOVE = 0.02, 0.08, 0.2
+"""How far what is seen moves between two frames, in widths of the picture: less is no other place; as it should be; more
+overlaps too little."""
 MIN_MATCHES = 20
 
 
@@ -47,7 +47,7 @@ def choose_frames(video: Path) -> List[Photo]:
     path = np.concatenate([[0.0], np.cumsum(moves)])
     if path[-1] < SMALLEST_MOVE * (MIN_PHOTOS - 1):
         raise InputError(f"The camera hardly moves in {video}: film a slow walk to the side, of two or three steps.")
-    count = int(np.clip(np.ceil(path[-1] / LARGEST_MOVE) + 1, MIN_PHOTOS, MOST_FRAMES))
+    count = int(np.clip(np.ceil(path[-1] / USUAL_MOVE) + 1, MIN_PHOTOS, MOST_FRAMES))
     covered = min(path[-1], LARGEST_MOVE * (count - 1))
     start = 0.5 * (path[-1] - covered)
     wanted = start + covered * np.linspace(0.0, 1.0, count)
