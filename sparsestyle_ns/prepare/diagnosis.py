@@ -8,7 +8,7 @@ lies in the middle of the picture, it moved along its line of sight.
 
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Dict, List, Optional, Sequence, Set, Tuple
+from typing import Dict, List, Optional, Sequence, Set
 
 import cv2
 import numpy as np
@@ -34,8 +34,6 @@ AXIS_SHARE = 0.2
 """Distance of the epipole from the middle, in longer sides, up to which a move is along the line of sight."""
 BLURRED = 0.3
 """Contrast of the finest detail, as a part of that of the photos' median, below which a photo is blurred."""
-SOFT = 3.0
-"""The same contrast over that of detail twice as coarse, below which a photo is blurred whatever the others are."""
 SAME_LOOK, SAME_PLACE = 0.35, 8.0
 """Distance of two descriptors up to which features of one photo look the same, if they are so many pixels apart."""
 REPEATED = 0.6
@@ -167,11 +165,9 @@ def _distance_from_turn(warp: Float[np.ndarray, "3 3"], middle: Float[np.ndarray
     return best
 
 
-def sharpness(grey: UInt8[np.ndarray, "H W"]) -> Tuple[float, float]:
-    """The contrast of a picture's finest detail, and the same over that of detail twice as coarse."""
-    fine = float(cv2.Laplacian(grey.astype(np.float32), cv2.CV_32F).std())
-    coarse = cv2.Laplacian(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 2.0), cv2.CV_32F)
-    return fine, fine / max(float(coarse.std()), 1e-6)
+def sharpness(grey: UInt8[np.ndarray, "H W"]) -> float:
+    """The contrast of a picture's finest detail: the standard deviation of its Laplacian, in grey values."""
+    return float(cv2.Laplacian(grey.astype(np.float32), cv2.CV_32F).std())
 
 
 def repeated_share(found: Features) -> float:
@@ -187,15 +183,15 @@ def repeated_share(found: Features) -> float:
 
 def _faint(seen: Comparison) -> List[str]:
     sharp = [sharpness(grey) for grey in seen.greys]
-    usual = float(np.median([fine for fine, _ in sharp]))
+    usual = float(np.median(sharp))
     sentences = []
-    for name, found, (fine, ratio) in zip(seen.names, seen.features, sharp, strict=True):
+    for name, found, contrast in zip(seen.names, seen.features, sharp, strict=True):
         if len(found) < MIN_FEATURES:
             sentences.append(
                 f"{name} has only {len(found)} features that can be found again: it is blurred, dark, or shows plain "
                 "surfaces; take it again, sharp and with something textured in it."
             )
-        elif fine < BLURRED * usual or ratio < SOFT:
+        elif contrast < BLURRED * usual:
             sentences.append(
                 f"{name} is blurred: take it again from the same place, with the camera held still and in more light."
             )

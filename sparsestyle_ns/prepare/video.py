@@ -23,8 +23,8 @@ COMPARED_WIDTH = 480
 """Pixels across at which frames are compared."""
 MOST_FRAMES = 8
 SMALLEST_MOVE, USUAL_MOVE, LARGEST_MOVE = 0.02, 0.08, 0.2
-"""How far what is seen moves between two frames, in widths of the picture: less is no other place; as it should be; more
-overlaps too little."""
+"""How far what is seen moves between two frames, in widths of the picture: less is no other place; as it should be;
+more overlaps too little."""
 MIN_MATCHES = 20
 
 
@@ -102,7 +102,7 @@ def _read_frame(reader: cv2.VideoCapture, number: int, rate: float) -> Optional[
     good, pixels = reader.retrieve()
     if not good:
         return None
-    return _Frame(number, number / rate, sharpness(_small(pixels))[0], np.ascontiguousarray(pixels[..., ::-1]))
+    return _Frame(number, number / rate, sharpness(_small(pixels)), np.ascontiguousarray(pixels[..., ::-1]))
 
 
 def _small(pixels: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:
