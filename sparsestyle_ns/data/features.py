@@ -4,8 +4,7 @@ The package's one matcher: poses are found, photos judged and depths triangulate
 """
 
 from dataclasses import dataclass
-from itertools import combinations
-from typing import Callable, Dict, Iterable, List, Optional, Sequence, Set, Tuple
+from typing import Dict, Iterable, List, Sequence, Set, Tuple
 
 import cv2
 import numpy as np
@@ -53,15 +52,10 @@ def find_features(grey: UInt8[np.ndarray, "H W"]) -> Features:
     return Features(np.array([keypoint.pt for keypoint in keypoints]), descriptors)
 
 
-def match_photos(
-    features: Sequence[Features],
-    pairs: Optional[Sequence[Pair]] = None,
-    each: Callable[[Sequence[Pair]], Iterable[Pair]] = iter,
-) -> PhotoMatches:
-    """Matches photos' features, of these pairs of photos or of all; `each` may show how far that is."""
-    pairs = list(combinations(range(len(features)), 2)) if pairs is None else pairs
-    found = {pair: np.stack(mutual_matches(*(features[index].descriptors for index in pair))) for pair in each(pairs)}
-    return PhotoMatches([each_photo.points for each_photo in features], found)
+def match_photos(features: Sequence[Features], pairs: Iterable[Pair]) -> PhotoMatches:
+    """Matches the features of these pairs of photos."""
+    found = {pair: np.stack(mutual_matches(*(features[index].descriptors for index in pair))) for pair in pairs}
+    return PhotoMatches([photo.points for photo in features], found)
 
 
 def linked_groups(count: int, links: Iterable[Pair]) -> List[Set[int]]:

@@ -7,7 +7,7 @@ those of blurred photos, so that a match that is off by a fraction of a pixel do
 """
 
 from dataclasses import dataclass
-from typing import List, Optional, Sequence, Tuple
+from typing import List, Optional, Sequence
 
 import cv2
 import numpy as np

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sparsestyle_ns.data.matches import PointMatches, match_points
 from sparsestyle_ns.data.photos import open_photo
-from sparsestyle_ns.data.scene_info import NDC, scene_info
+from sparsestyle_ns.data.scene_info import NDC, SCENE_INFO, scene_info
 from sparsestyle_ns.data.view_selection import evenly_spaced
 
 LONGEST_SIDE = 504
@@ -76,7 +76,8 @@ class Scene:
         """Points that are seen in two of `matched_views`; photos are numbered by their places there."""
         chosen = self.matched_views
         names = [self.outputs.image_filenames[index].name for index in chosen]
-        cameras, tracks = self.cameras[torch.tensor(chosen)], scene_info(self.outputs).tracks
+        cameras, info = self.cameras[torch.tensor(chosen)], self.outputs.metadata.get(SCENE_INFO)
+        tracks = None if info is None else info.tracks
         return match_points([self.photos[index] for index in chosen], cameras, names, tracks)
 
     @property

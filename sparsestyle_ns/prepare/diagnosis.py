@@ -8,7 +8,7 @@ lies in the middle of the picture, it moved along its line of sight.
 
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Dict, List, Optional, Sequence, Set, Tuple
+from typing import Dict, List, Optional, Sequence, Set
 
 import cv2
 import numpy as np
@@ -16,14 +16,16 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
 from sparsestyle_ns.data.features import Features, Pair, PhotoMatches, find_features, linked_groups, mutual_matches
+from sparsestyle_ns.prepare.framing import MIN_PHOTOS
 from sparsestyle_ns.utils.progress import track
 
 COMPARED_SIDE = 1000
 """Pixels along the longer side of the pictures that are compared, at most."""
 MIN_FEATURES = 300
 """Features of a photo below which it is blurred, or shows plain surfaces."""
-MIN_MATCHES = 30
-"""Matches that agree on one geometry, below which two photos count as sharing nothing: a dozen agree by chance."""
+MIN_MATCHES = 20
+"""Matches that agree on one geometry, below which two photos count as sharing nothing: of photos of different things up
+to 16 agreed."""
 EPIPOLAR_ERROR, FLAT_ERROR = 1.5, 3.0
 """Pixels that a match may be off F and off a homography. Depth that moves a point by less is lost in noise."""
 FLAT_SHARE = 0.85
@@ -32,14 +34,16 @@ AXIS_SHARE = 0.2
 """Distance of the epipole from the middle, in longer sides, up to which a move is along the line of sight."""
 BLURRED = 0.3
 """Contrast of the finest detail, as a part of that of the photos' median, below which a photo is blurred."""
-SOFT = 3.0
-"""The same contrast over that of detail twice as coarse, below which a photo is blurred whatever the others are."""
 SAME_LOOK, SAME_PLACE = 0.35, 8.0
 """Distance of two descriptors up to which features of one photo look the same, if they are so many pixels apart."""
-REPEATED = 0.4
-"""Share of a photo's features that look like another one of it, from which on its texture repeats itself."""
-TURNED = 0.03
-"""How far a homography may be from a mere turn of the camera, by the best focal length."""
+REPEATED = 0.6
+"""Share of a photo's features that look like another one of it, from which on its texture repeats itself: bricks and
+tiles have 0.8 and more, other photos at most 0.25."""
+TURNED = 0.06
+"""How far a homography may be from a mere turn of the camera, by the best focal length: of turns 0.02 to 0.05, of a
+wall 0.15 and more."""
+AMBIGUOUS = 0.75
+"""Share of the matches that agree on a geometry, below which matches of a repeated pattern aren't believed."""
 
 
 @dataclass
@@ -119,7 +123,7 @@ def compare(images: Sequence[Image.Image], names: Sequence[str]) -> Comparison:
 
 def findings(seen: Comparison) -> List[str]:
     """What is wrong with compared photos, a sentence each; empty where nothing is."""
-    return [*_faint(seen), *unlinked(seen), *no_depth(seen), *_without_depth(seen)]
+    return [*_faint(seen), *unlinked(seen), *_of_moves(seen), *repeating(seen)]
 
 
 def shrink(image: Image.Image) -> UInt8[np.ndarray, "H W"]:
@@ -140,7 +144,7 @@ def compare_photos(first: Features, second: Features, shape: Sequence[int]) -> L
     if matrix is None or matrix.shape != (3, 3) or inliers.sum() < MIN_MATCHES:
         return Link(0 if inliers is None else int(inliers.sum()), matched=matched)
     agree = inliers.ravel() > 0
-    warp, explained = cv2.findHomography(start[agree], end[agree], cv2.RANSAC, FLAT_ERROR, maxIters=5_000)
+    warp, explained = cv2.findHomography(start[agree], end[agree], cv2.USAC_MAGSAC, FLAT_ERROR, maxIters=5_000)
     flat = 0.0 if explained is None else float(explained.mean())
     homogeneous = np.linalg.svd(matrix)[2][-1]
     middle = 0.5 * np.array([shape[1], shape[0]])
@@ -161,11 +165,9 @@ def _distance_from_turn(warp: Float[np.ndarray, "3 3"], middle: Float[np.ndarray
     return best
 
 
-def sharpness(grey: UInt8[np.ndarray, "H W"]) -> Tuple[float, float]:
-    """The contrast of a picture's finest detail, and the same over that of detail twice as coarse."""
-    fine = float(cv2.Laplacian(grey.astype(np.float32), cv2.CV_32F).std())
-    coarse = cv2.Laplacian(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 2.0), cv2.CV_32F)
-    return fine, fine / max(float(coarse.std()), 1e-6)
+def sharpness(grey: UInt8[np.ndarray, "H W"]) -> float:
+    """The contrast of a picture's finest detail: the standard deviation of its Laplacian, in grey values."""
+    return float(cv2.Laplacian(grey.astype(np.float32), cv2.CV_32F).std())
 
 
 def repeated_share(found: Features) -> float:
@@ -181,15 +183,15 @@ def repeated_share(found: Features) -> float:
 
 def _faint(seen: Comparison) -> List[str]:
     sharp = [sharpness(grey) for grey in seen.greys]
-    usual = float(np.median([fine for fine, _ in sharp]))
+    usual = float(np.median(sharp))
     sentences = []
-    for name, found, (fine, ratio) in zip(seen.names, seen.features, sharp, strict=True):
+    for name, found, contrast in zip(seen.names, seen.features, sharp, strict=True):
         if len(found) < MIN_FEATURES:
             sentences.append(
                 f"{name} has only {len(found)} features that can be found again: it is blurred, dark, or shows plain "
                 "surfaces; take it again, sharp and with something textured in it."
             )
-        elif fine < BLURRED * usual or ratio < SOFT:
+        elif contrast < BLURRED * usual:
             sentences.append(
                 f"{name} is blurred: take it again from the same place, with the camera held still and in more light."
             )
@@ -202,7 +204,7 @@ def unlinked(seen: Comparison) -> List[str]:
     if len(groups) == len(seen.names):
         return [
             "No two photos share enough: they have too few matches to tell where the camera stood; take photos that "
-            f"overlap by two thirds, of one thing that doesn't move.{_repetition(seen, range(len(seen.names)))}"
+            "overlap by two thirds, of one thing that doesn't move."
         ]
     sentences = []
     for group in groups[1:]:
@@ -211,17 +213,30 @@ def unlinked(seen: Comparison) -> List[str]:
         verb = "shares" if len(group) == 1 else "share"
         sentences.append(
             f"{_listed(seen, group)} {verb} too little with the other photos (at most {best} matches that fit "
-            f"together, {MIN_MATCHES} are needed);{_repetition(seen, group)} {next_photo(seen, group)}"
+            f"together, {MIN_MATCHES} are needed); {next_photo(seen, group)}"
         )
     return sentences
 
 
-def _repetition(seen: Comparison, photos: Sequence[int]) -> str:
-    """A part of a sentence that says which of the photos' texture repeats itself; empty for none."""
-    names = [seen.names[photo] for photo in sorted(photos) if repeated_share(seen.features[photo]) > REPEATED]
+def repeating(seen: Comparison) -> List[str]:
+    """Which photos show one pattern again and again, in a sentence, if any do."""
+    names = [name for name, found in zip(seen.names, seen.features, strict=True) if repeated_share(found) > REPEATED]
     if not names:
-        return ""
-    return f" one pattern comes again and again in {', '.join(names)}, so that its copies are taken for each other;"
+        return []
+    return [
+        f"One pattern comes again and again in {', '.join(names)}, whose copies are taken for each other; take photos "
+        "in which something is there only once, a foot's length from each other, the next one beside where "
+        f"{names[0]} was taken."
+    ]
+
+
+def hopeless(seen: Comparison) -> bool:
+    """Whether photos' matches can't tell where three of them were taken."""
+    links = [link for link in seen.links.values() if link.linked]
+    if len(seen.groups()[0]) < MIN_PHOTOS or no_depth(seen):
+        return True
+    believed = sum(link.agreeing for link in links) >= AMBIGUOUS * sum(link.matched.shape[1] for link in links)
+    return not believed and bool(repeating(seen))
 
 
 def next_photo(seen: Comparison, group: Set[int]) -> str:
@@ -235,7 +250,7 @@ def next_photo(seen: Comparison, group: Set[int]) -> str:
     shift = np.zeros(2) if len(first) < 4 else np.median(second - first, axis=0)
     if pair[0] == inside:
         shift = -shift  # now from the known photo to the one to be linked
-    height, width = seen.greys[0].shape
+    width = seen.greys[0].shape[1]
     step = f"take one more photo halfway between {known} and {seen.names[inside]}"
     if abs(shift[0]) > 0.1 * width:  # what is seen moves against the camera
         side = "right" if shift[0] < 0 else "left"
@@ -247,11 +262,11 @@ def _listed(seen: Comparison, photos: Set[int]) -> str:
     return ", ".join(seen.names[photo] for photo in sorted(photos))
 
 
-def _without_depth(seen: Comparison) -> List[str]:
+def _of_moves(seen: Comparison) -> List[str]:
     linked = {pair: link for pair, link in seen.links.items() if link.linked}
     epipoles = [link.epipole for link in linked.values() if link.has_depth]
-    if not epipoles:
-        return []
+    if no_depth(seen) or not epipoles:
+        return no_depth(seen)
     # A short move's epipole is uncertain, so one pair alone says little.
     if np.median(np.linalg.norm(epipoles, axis=-1)) < AXIS_SHARE:
         return [
@@ -269,7 +284,7 @@ def _without_depth(seen: Comparison) -> List[str]:
 def no_depth(seen: Comparison) -> List[str]:
     """Why all photos are warped copies of each other: of one place, or of one plane; empty where they aren't."""
     links = [link for link in seen.links.values() if link.linked]
-    if not links or any(link.has_depth for link in links):
+    if not links or np.average([link.flat for link in links], weights=[link.agreeing for link in links]) < FLAT_SHARE:
         return []
     first = seen.names[0]
     if np.median([link.turn for link in links]) < TURNED:
@@ -280,22 +295,21 @@ def no_depth(seen: Comparison) -> List[str]:
         ]
     return [
         "All that the photos share lies in one plane, as a wall or a picture does, from which neither depth nor focal "
-        f"length can be told; take them again with something standing before it, as a step to the side of where {first} "
-        "was taken, with a corner of the room or a piece of furniture in sight."
+        f"length can be told; take them again with something standing before it, as a step to the side of where "
+        f"{first} was taken, with a corner of the room or a piece of furniture in sight."
     ]
 
 
-def left_out(seen: Comparison, placed: Sequence[int]) -> str:
-    """Which photos have no pose, and why, in sentences; `placed` are those that have one."""
-    missing = [photo for photo in range(len(seen.names)) if photo not in placed]
+def left_out(seen: Comparison, placed: Sequence[int]) -> List[str]:
+    """Why photos have no pose, in sentences; `placed` are those that have one."""
+    missing = {photo for photo in range(len(seen.names)) if photo not in placed}
     apart = {photo for group in seen.groups()[1:] for photo in group}
-    others = [seen.names[photo] for photo in missing if photo not in apart]
-    sentences = [sentence for sentence in unlinked(seen)] if apart & set(missing) else []
-    if others:
+    sentences = unlinked(seen) if apart & missing else []
+    if missing - apart:
+        near = seen.names[next((photo for photo in placed), 0)]
         sentences.append(
-            f"{', '.join(others)} can't be placed: no camera sees all that matches there; it was taken with another "
-            "zoom, or things moved, or one thing stands there more than once; take it again a step nearer to "
-            f"{seen.names[placed[0]] if placed else seen.names[0]}, without zoom, when nothing moves."
+            f"{_listed(seen, missing - apart)} can't be placed, as no camera sees all that matches there: that may be "
+            "another zoom, things that moved, or one thing that is there more than once; take it again a step beside "
+            f"{near}, without zoom, when nothing moves."
         )
-    names = ", ".join(seen.names[photo] for photo in missing)
-    return f"No pose is found for {names}. {' '.join(sentences)}"
+    return sentences

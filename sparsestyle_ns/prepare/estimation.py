@@ -13,8 +13,8 @@ from sparsestyle_ns.core.camera_paths import is_forward_facing
 from sparsestyle_ns.data.estimated import POSES_ESTIMATED, TRANSFORMS
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.data.tracks import Tracks
-from sparsestyle_ns.prepare.diagnosis import Comparison, left_out, no_depth, unlinked
-from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, Photo
+from sparsestyle_ns.prepare.diagnosis import Comparison, findings, hopeless, left_out
+from sparsestyle_ns.prepare.framing import Framing, Photo
 from sparsestyle_ns.prepare.lenses import shared_lenses
 from sparsestyle_ns.prepare.poses import POSES_BOUNDS
 from sparsestyle_ns.prepare.reconstruction import Reconstruction, num_steps, reconstruct
@@ -94,7 +94,7 @@ class EstimatedPoses:
         focals = sorted({round(focal / width, 3) for focal in self.found.focals.tolist()})
         bend = self.found.distortion[np.abs(self.found.distortion).argmax()]
         return (
-            f"Poses are estimated from {len(self.seen.names)} photos: {len(self.found.points)} points, "
+            f"Poses are estimated from {len(self.found.photos)} photos: {len(self.found.points)} points, "
             f"{self.found.error:.2f} pixels off on average at {width} pixels across; focal length "
             f"{', '.join(f'{focal:.3g}' for focal in focals)} widths" + (f", distortion {bend:+.3f}" if bend else "")
         )
@@ -109,21 +109,47 @@ def poses_bounds_row(
 
 
 def estimate_poses(photos: Sequence[Photo], framings: Sequence[Framing], seen: Comparison) -> EstimatedPoses:
-    """Finds where photos were taken, and says which are left out and why.
+    """Finds where photos were taken; some may be left out.
 
     Raises:
         InputError: that can't be told of three photos; it says why, and which photo to take next.
     """
-    hopeless = [*no_depth(seen), *unlinked(seen)]
-    if len(seen.groups()[0]) < MIN_PHOTOS or no_depth(seen):
-        raise InputError(f"Where the photos were taken can't be told. {' '.join(hopeless)}")
+    reasons = findings(seen)
+    if hopeless(seen):
+        raise InputError(f"Where the photos were taken can't be told. {' '.join(reasons)}")
     lenses, lens_of = shared_lenses([(photo.exif, photo.image.size) for photo in photos])
     height, width = seen.greys[0].shape
     longer = max(framings[0].scaled) * width / framings[0].size[0]
     with bar("Estimating poses", num_steps(lenses)) as progress:
         found = reconstruct(seen.matches, (width, height), longer, lenses, lens_of, progress.advance)
     if found is None:
-        raise InputError(f"Where the photos were taken can't be told. {left_out(seen, ())}")
+        raise InputError(f"Where the photos were taken can't be told. {' '.join(reasons or left_out(seen, ()))}")
     if len(found.photos) < len(photos):
-        print(f"Warning: {left_out(seen, found.photos)}", flush=True)
+        names = ", ".join(name for photo, name in enumerate(seen.names) if photo not in found.photos)
+        print(f"Warning: {names}: left out, as no pose is found", flush=True)
+        reasons += [reason for reason in left_out(seen, found.photos) if reason not in reasons]
+    for reason in [*reasons, *_zoomed(found, lens_of, seen.names)]:
+        print(f"Warning: {reason}", flush=True)
     return EstimatedPoses(found, seen)
+
+
+def _zoomed(found: Reconstruction, lens_of: Sequence[int], names: Sequence[str]) -> List[str]:
+    """Which photos of one lens, as far as EXIF tells, have a focal length of their own; in a sentence, if any."""
+    usual = {
+        lens: float(
+            np.median(
+                [focal for photo, focal in zip(found.photos, found.focals, strict=True) if lens_of[photo] == lens]
+            )
+        )
+        for lens in set(lens_of)
+    }
+    factors = {
+        names[photo]: focal / usual[lens_of[photo]] for photo, focal in zip(found.photos, found.focals, strict=True)
+    }
+    apart = [f"{name} ({factor:.2g} times)" for name, factor in factors.items() if abs(factor - 1.0) > 0.05]
+    if not apart:
+        return []
+    return [
+        f"{', '.join(apart)} seems to be taken with another zoom than the others, and gets a focal length of its own, "
+        "which is less certain; take it again with theirs, from nearer or farther."
+    ]

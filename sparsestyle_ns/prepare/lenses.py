@@ -15,8 +15,8 @@ SHORTEST, LONGEST = 0.2, 20.0
 EXIF_SPREAD = 0.05
 """Standard deviation of a focal length by EXIF, in logarithms: it is rounded, and of a picture cut to another shape."""
 USUAL_FOCAL, USUAL_SPREAD = 0.9, 0.35
-"""Focal length where EXIF says nothing: the mean and standard deviation of logarithms. A telephone's main camera has 0.7
-to 0.85 longer sides, its wide one half of that; other cameras mostly have 0.8 to 2."""
+"""Focal length where EXIF says nothing: the mean and standard deviation of logarithms. A telephone's main camera has
+0.7 to 0.85 longer sides, its wide one half of that; other cameras mostly have 0.8 to 2."""
 
 
 @dataclass(frozen=True)

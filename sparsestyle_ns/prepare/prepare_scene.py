@@ -61,8 +61,8 @@ def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> Pr
         read, framings = ([items[photo] for photo in found.found.photos] for items in (read, framings))
     else:
         found = poses
-    for sentence in findings(seen):
-        print(f"Warning: {sentence}", flush=True)
+        for sentence in findings(seen):
+            print(f"Warning: {sentence}", flush=True)
     print(found.summary())
     names = _write(found, read, framings, output)
     return PreparedScene(output, found.parser, names)

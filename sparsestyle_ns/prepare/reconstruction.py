@@ -28,6 +28,11 @@ MIN_FIRST_ANGLE = 4.0
 """Degrees between rays to points of those two."""
 MAX_ERROR = 2.0
 """Pixels that a point may be off a photo's feature to count as seen there."""
+MIN_ANGLE = 1.0
+"""Degrees between the outermost rays to a point, in the median, below which the camera hardly moved."""
+MIN_ZOOM, MIN_ZOOM_GAIN = 1.2, 0.25
+"""Factor between focal lengths of photos from which on they may be zoomed; and the share by which focal lengths of
+their own must lower the error, for that to be believed. Zoomed photos lowered it by more than half."""
 MIN_GAIN = 0.05
 """Share by which a lens's distortion must lower the squared error to be believed."""
 CORRELATED = 8.0
@@ -36,6 +41,9 @@ sets of three to eight photos."""
 STEP, STEPS = 0.1, 6
 """Factors by which focal lengths are tried about those that fit best: their logarithms' step, and steps to either
 side."""
+
+# What it logs is for its developers; here one sentence says what went wrong.
+pycolmap.logging.minloglevel, pycolmap.logging.alsologtostderr = pycolmap.logging.FATAL, False
 
 
 @dataclass
@@ -66,6 +74,20 @@ class Reconstruction:
         points = self.points[self.seen[self.seen[:, 0] == photo, 1]]
         return -(points - pose[:, 3]) @ pose[:, 2]
 
+    def angle(self) -> float:
+        """The largest angle between rays to a point, in degrees, in the median of the points."""
+        places = {photo: pose[:, 3] for photo, pose in zip(self.photos, self.poses, strict=True)}
+        rays = self.points[self.seen[:, 1]] - np.stack([places[photo] for photo in self.seen[:, 0]])
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        by_point = np.split(rays[np.argsort(self.seen[:, 1], kind="stable")], _starts(self.seen[:, 1]))
+        widest = [float((rays @ rays.T).min()) for rays in by_point]
+        return float(np.degrees(np.arccos(np.clip(np.median(widest), -1.0, 1.0))))
+
+
+def _starts(points: Int[np.ndarray, "observations"]) -> Int[np.ndarray, "others"]:
+    """Where each point but the first begins in the sorted observations."""
+    return np.flatnonzero(np.diff(np.sort(points))) + 1
+
 
 def reconstruct(
     matches: PhotoMatches,
@@ -84,20 +106,79 @@ def reconstruct(
         lenses, lens_of: with which lenses photos may have been taken, and each photo's one.
         step: called after each of `num_steps` pieces of work.
     """
-    attempts, pairs = [], _pair_geometries(matches, size, longer, lenses, lens_of)
-    for focal in starting_focals(lenses):
-        cameras = _cameras(size, longer, lenses, focal)
-        attempts.append(_map(matches, pairs, cameras, lens_of))
-        step()
-    found = [attempt for attempt in attempts if attempt is not None and attempt.num_reg_images() >= MIN_PHOTOS]
-    if not found:
+    best = _best_of_starts(matches, size, longer, lenses, lens_of, step)
+    split = _split_by_zoom(best, matches, size, lenses, lens_of)
+    step()
+    if split is not None:
+        other = _best_of_starts(matches, size, longer, *split, lambda: None)
+        if other is not None and _is_better(other, best):
+            best, (lenses, lens_of) = other, split
+    if best is None:
         return None
-    best = max(found, key=lambda model: (model.num_reg_images(), model.compute_num_observations()))
     best = _distorted_where_it_matters(best)
     step()
     settled = _settle_focals(best, [longer * lens.focal for lens in lenses], [lens.spread for lens in lenses])
     step()
-    return _read(settled)
+    return None if settled is None else _checked(_read(settled))
+
+
+def _checked(found: Reconstruction) -> Optional[Reconstruction]:
+    """What was found, if each photo sees enough points, from places that are far enough apart."""
+    counts = np.bincount(found.seen[:, 0], minlength=max(found.photos) + 1)[found.photos]
+    good = np.isfinite(found.poses).all() and np.isfinite(found.focals).all() and counts.min() >= MIN_PHOTO_MATCHES
+    return found if good and found.angle() >= MIN_ANGLE else None
+
+
+def _best_of_starts(
+    matches: PhotoMatches,
+    size: Size,
+    longer: float,
+    lenses: Sequence[Lens],
+    lens_of: Sequence[int],
+    step: Callable[[], None],
+) -> Optional[pycolmap.Reconstruction]:
+    """Of what mapping finds from several focal lengths, that which explains most; None for fewer than three photos."""
+    attempts, pairs = [], _pair_geometries(matches, size, longer, lenses, lens_of)
+    for focal in starting_focals(lenses):
+        attempts.append(_map(matches, pairs, _cameras(size, longer, lenses, focal), lens_of))
+        step()
+    found = [model for model in attempts if model is not None and model.num_reg_images() >= MIN_PHOTOS]
+    return max(found, key=lambda model: (model.num_reg_images(), model.compute_num_observations()), default=None)
+
+
+def _is_better(split: pycolmap.Reconstruction, shared: Optional[pycolmap.Reconstruction]) -> bool:
+    """Whether zoomed photos explain much that one lens for all doesn't."""
+    if shared is None or split.num_reg_images() != shared.num_reg_images():
+        return shared is None or split.num_reg_images() > shared.num_reg_images()
+    errors = (model.compute_mean_reprojection_error() for model in (split, shared))
+    return next(errors) < (1.0 - MIN_ZOOM_GAIN) * next(errors)
+
+
+def _split_by_zoom(
+    best: Optional[pycolmap.Reconstruction],
+    matches: PhotoMatches,
+    size: Size,
+    lenses: Sequence[Lens],
+    lens_of: Sequence[int],
+) -> Optional[Tuple[List[Lens], List[int]]]:
+    """Lenses of which photos that seem to be zoomed have their own; None where none does, or EXIF knows the lenses."""
+    if any(lens.known for lens in lenses):
+        return None
+    count, longer = len(lens_of), float(max(size))
+    start = USUAL_FOCAL if best is None else float(np.median([one.params[0] for one in best.cameras.values()])) / longer
+    each = [Lens() for _ in range(count)]
+    pairs = _pair_geometries(matches, size, longer, each, range(count))
+    own = _map(matches, pairs, _cameras(size, longer, each, start), range(count))
+    if own is None or own.num_reg_images() < MIN_PHOTOS:
+        return None
+    posed = (image for image in own.images.values() if image.has_pose)
+    focals = {image.image_id - 1: own.cameras[image.camera_id].params[0] for image in posed}
+    usual = float(np.median(list(focals.values())))
+    zoomed = [photo for photo, focal in sorted(focals.items()) if abs(np.log(focal / usual)) > np.log(MIN_ZOOM)]
+    if not zoomed:
+        return None
+    which = [len(lenses) + zoomed.index(photo) if photo in zoomed else lens_of[photo] for photo in range(count)]
+    return [*lenses, *(Lens() for _ in zoomed)], which
 
 
 def starting_focals(lenses: Sequence[Lens]) -> Sequence[float]:
@@ -107,7 +188,7 @@ def starting_focals(lenses: Sequence[Lens]) -> Sequence[float]:
 
 def num_steps(lenses: Sequence[Lens]) -> int:
     """How often `reconstruct` calls its `step`."""
-    return len(starting_focals(lenses)) + 2
+    return len(starting_focals(lenses)) + 3
 
 
 def _cameras(size: Size, longer: float, lenses: Sequence[Lens], focal: float) -> List[pycolmap.Camera]:
@@ -152,7 +233,6 @@ def _map(
     lens_of: Sequence[int],
 ) -> Optional[pycolmap.Reconstruction]:
     """COLMAP's incremental mapping; it counts cameras and images from 1."""
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # it says its own on stderr
     pycolmap.set_random_seed(0)
     with tempfile.TemporaryDirectory(prefix="sparsestyle-") as name:
         path, folder = Path(name) / "matches.db", Path(name)
@@ -195,7 +275,11 @@ def _adjust(model: pycolmap.Reconstruction, focals: bool, distortion: bool = Fal
     )
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.solver_options.num_threads = 1
-    pycolmap.bundle_adjustment(model, options)
+    images = pycolmap.BundleAdjustmentConfig()
+    for image in model.reg_image_ids():
+        images.add_image(image)
+    images.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_ceres_bundle_adjuster(options, images, model).solve()
     return 0.5 * float(np.log1p(_errors(model) ** 2).sum())
 
 
@@ -224,8 +308,8 @@ def _distorted_where_it_matters(model: pycolmap.Reconstruction) -> pycolmap.Reco
 
 def _settle_focals(
     model: pycolmap.Reconstruction, usual: Sequence[float], spreads: Sequence[float]
-) -> pycolmap.Reconstruction:
-    """The model with the most probable focal lengths, by the photos and by what lenses usually have.
+) -> Optional[pycolmap.Reconstruction]:
+    """The model with the most probable focal lengths, by the photos and by what lenses usually have; None for no sense.
 
     Where the photos say little, as of small moves, the latter weighs more.
     """
@@ -239,6 +323,8 @@ def _settle_focals(
         return fit + 0.5 * sum(off), tried
 
     values = {shift: improbability(STEP * shift)[0] for shift in (-1, 0, 1)}
+    if not np.isfinite(list(values.values())).all():
+        return None
     while (lowest := min(values, key=values.get)) in (min(values), max(values)) and abs(lowest) < STEPS:
         beyond = lowest + (1 if lowest > 0 else -1)
         values[beyond] = improbability(STEP * beyond)[0]
@@ -275,9 +361,9 @@ def _read(model: pycolmap.Reconstruction) -> Reconstruction:
         poses=np.stack([_pose(image) for image in images]),
         focals=np.array([camera.params[0] for camera in cameras]),
         distortion=np.array([camera.params[3] if len(camera.params) > 3 else 0.0 for camera in cameras]),
-        points=np.array([point.xyz for point in model.points3D.values()]),
+        points=np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3),
         seen=np.array(elements, dtype=int).reshape(-1, 3)[good],
-        error=float(errors[good].mean()),
+        error=float(errors[good].mean()) if good.any() else np.inf,
     )
 
 

@@ -1,6 +1,7 @@
 """Which frames of a video a scene is made of: sharp ones, with equal moves of the camera between them."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import List, Optional
 
@@ -21,8 +22,9 @@ WINDOWS, LOOKED_AT = 32, 4
 COMPARED_WIDTH = 480
 """Pixels across at which frames are compared."""
 MOST_FRAMES = 8
-SMALLEST_MOVE, LARGEST_MOVE = 0.02, 0.2
-"""What is seen moves by between two frames, in widths of the picture: less is no other place, more overlaps too little."""
+SMALLEST_MOVE, USUAL_MOVE, LARGEST_MOVE = 0.02, 0.08, 0.2
+"""How far what is seen moves between two frames, in widths of the picture: less is no other place; as it should be;
+more overlaps too little."""
 MIN_MATCHES = 20
 
 
@@ -45,7 +47,7 @@ def choose_frames(video: Path) -> List[Photo]:
     path = np.concatenate([[0.0], np.cumsum(moves)])
     if path[-1] < SMALLEST_MOVE * (MIN_PHOTOS - 1):
         raise InputError(f"The camera hardly moves in {video}: film a slow walk to the side, of two or three steps.")
-    count = int(np.clip(np.ceil(path[-1] / LARGEST_MOVE) + 1, MIN_PHOTOS, MOST_FRAMES))
+    count = int(np.clip(np.ceil(path[-1] / USUAL_MOVE) + 1, MIN_PHOTOS, MOST_FRAMES))
     covered = min(path[-1], LARGEST_MOVE * (count - 1))
     start = 0.5 * (path[-1] - covered)
     wanted = start + covered * np.linspace(0.0, 1.0, count)
@@ -100,7 +102,7 @@ def _read_frame(reader: cv2.VideoCapture, number: int, rate: float) -> Optional[
     good, pixels = reader.retrieve()
     if not good:
         return None
-    return _Frame(number, number / rate, sharpness(_small(pixels))[0], np.ascontiguousarray(pixels[..., ::-1]))
+    return _Frame(number, number / rate, sharpness(_small(pixels)), np.ascontiguousarray(pixels[..., ::-1]))
 
 
 def _small(pixels: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:
@@ -112,7 +114,7 @@ def _small(pixels: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:
 def _moves(frames: List[_Frame]) -> Float[np.ndarray, "gaps"]:
     """How far what is seen moves from each frame to the next, in widths."""
     features = [find_features(_small(frame.pixels[..., ::-1])) for frame in track(frames, "Looking at frames")]
-    return np.array([_move(first, second) for first, second in zip(features[:-1], features[1:], strict=True)])
+    return np.array([_move(first, second) for first, second in pairwise(features)])
 
 
 def _move(first: Features, second: Features) -> float:
