@@ -137,22 +137,6 @@ def _look_at(
     return _View(rays, directions, rgba, pixels / focal.mean())
 
 
-def distances_along(
-    origins: Float[np.ndarray, "2 rays 3"], directions: Float[np.ndarray, "2 rays 3"]
-) -> Float[np.ndarray, "2 rays"]:
-    """Where two rays of unit direction come nearest to each other: the distance from either's origin.
-
-    Infinite where they are parallel; negative where they come nearest behind an origin.
-    """
-    cosine = directions.prod(axis=0).sum(axis=-1)
-    # 1 − cos² without its cancellation for rays that are nearly parallel.
-    square_of_sine = (np.cross(*directions) ** 2).sum(axis=-1)
-    first, second = (directions * (origins[0] - origins[1])).sum(axis=-1)
-    along = np.stack([cosine * second - first, second - cosine * first])
-    parallel = square_of_sine < 1e-12
-    return np.where(parallel, np.inf, along / np.where(parallel, 1.0, square_of_sine))
-
-
 def _neighbouring_pairs(poses: Float[np.ndarray, "views 3 4"]) -> List[Pair]:
     agreement = poses[:, :, 2] @ poses[:, :, 2].T
     near = np.argsort(-agreement, axis=1)[:, : NEAREST_VIEWS + 1]

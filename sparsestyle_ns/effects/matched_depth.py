@@ -6,12 +6,12 @@ Stage 1 learns that rays to such points end there (DS-NeRF's idea, Deng et al. 2
 from dataclasses import dataclass
 from typing import Optional
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sparsestyle_ns.data.matches import distances_along, why_unmatched
+from sparsestyle_ns.core.triangulation import distances_to_meeting
+from sparsestyle_ns.data.matches import why_unmatched
 from sparsestyle_ns.effects.decisions import Decisions, Measurement
 from sparsestyle_ns.effects.scene import Scene
 
@@ -34,14 +34,13 @@ class MatchedRays:
 
 def triangulate(scene: Scene) -> MatchedRays:
     """Two rays, one from each camera, for each point that two photos share: where they come nearest, if before both."""
-    matches, poses = scene.matches, scene.cameras.camera_to_worlds.double().numpy()
-    views = np.array(scene.matched_views, dtype=int)[matches.views]
-    origins = poses[views, :, 3]
-    distances = distances_along(origins, matches.directions)
-    ahead = (np.isfinite(distances) & (distances > 0)).all(axis=0)
-    parts = (origins, matches.directions, distances[..., None])
-    rays = (torch.from_numpy(part[:, ahead].reshape(-1, part.shape[-1])).float() for part in parts)
-    return MatchedRays(*rays, views=torch.from_numpy(views[:, ahead].reshape(-1)))
+    matches, poses = scene.matches, scene.cameras.camera_to_worlds.double()
+    views = torch.tensor(scene.matched_views)[torch.from_numpy(matches.views)]
+    origins, directions = poses[views][..., 3], torch.from_numpy(matches.directions)
+    distances = distances_to_meeting(origins, directions)
+    ahead = (distances.isfinite() & (distances > 0)).all(dim=0)
+    rays = (part[:, ahead].flatten(0, 1) for part in (origins, directions, distances[..., None]))
+    return MatchedRays(*(part.float() for part in rays), views=views[:, ahead].flatten())
 
 
 def measure_matched_depth(scene: Scene) -> Measurement:

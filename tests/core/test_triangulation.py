@@ -27,6 +27,17 @@ def test_rays_meet_where_they_lead():
     assert reprojection_errors(origins, directions, 0.0).max() < 1e-8
 
 
+def test_turned_away_from_each_other_lines_meet_behind_the_cameras():
+    origins, directions = rays_to(POINTS)
+    torch.testing.assert_close(distances_to_meeting(origins, -directions), -distances_to_meeting(origins, directions))
+
+
+def test_a_ray_that_passes_another_is_measured_where_it_comes_nearest_and_a_parallel_one_never():
+    origins = torch.tensor([[[0.0, 0, 0], [0, 0, 0]], [[-2.0, 0.5, -3], [1, 0, 0]]])
+    directions = torch.tensor([[[0.0, 0, -1], [0, 0, -1]], [[1.0, 0, 0], [0, 0, -1]]])
+    assert distances_to_meeting(origins, directions).tolist() == [[3.0, torch.inf], [2.0, torch.inf]]
+
+
 def test_a_hand_worked_pair_that_passes_at_a_distance():
     # One ray along z from the origin, one along x from (-3, 0.2, 4): they pass 0.2 apart, at 4 and at 3.
     origins = torch.tensor([[[0.0, 0.0, 0.0]], [[-3.0, 0.2, 4.0]]])

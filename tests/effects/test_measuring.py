@@ -11,15 +11,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
 from sparsestyle_ns.data.features import mutual_matches
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.data.matches import (
-    LENSES,
-    PointMatches,
-    distances_along,
-    epipolar_error,
-    rays_of,
-    sample,
-    undistorted,
-)
+from sparsestyle_ns.data.matches import LENSES, PointMatches, epipolar_error, rays_of, sample, undistorted
 from sparsestyle_ns.data.reading import read_scene
 from sparsestyle_ns.effects.lens_distortion import largest_shift, measure_lens_distortion
 from sparsestyle_ns.effects.matched_colors import fit_gains, measure_exposure, measure_view_color
@@ -160,25 +152,6 @@ def test_photos_that_hang_together_by_nothing_have_no_measurable_gain():
     apart = (whole.views[0] < 2) == (whole.views[1] < 2)
     parts = (part[:, apart] for part in (whole.views, whole.colors, whole.directions))
     assert PointMatches(*parts, num_views=4).fewest_in_a_view() == 0
-
-
-def test_rays_to_the_same_point_meet_at_their_distances_from_it():
-    generator = np.random.default_rng(0)
-    points = generator.uniform(-1, 1, (20, 3))
-    origins = generator.uniform(3, 5, (2, 20, 3))
-    expected = np.linalg.norm(points - origins, axis=-1)
-    directions = (points - origins) / expected[..., None]
-    assert distances_along(origins, directions) == pytest.approx(expected)
-    # Turned away from each other's side, the same lines meet behind the cameras.
-    behind = distances_along(origins, -directions)
-    assert behind == pytest.approx(-expected)
-
-
-def test_rays_that_pass_each_other_are_measured_where_they_come_nearest_and_parallel_ones_never():
-    origins, ahead = np.array([[0.0, 0, 0], [0, 0, 0]]), np.array([[0.0, 0, -1], [0, 0, -1]])
-    others, crossing = np.array([[-2.0, 0.5, -3], [1, 0, 0]]), np.array([[1.0, 0, 0], [0, 0, -1]])
-    first, second = distances_along(np.stack([origins, others]), np.stack([ahead, crossing]))
-    assert (first.tolist(), second.tolist()) == ([3.0, np.inf], [2.0, np.inf])
 
 
 def test_points_of_a_made_scene_are_matched_at_their_true_depth(tmp_path):
