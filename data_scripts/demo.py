@@ -9,7 +9,6 @@ passed on. A finished stage is not done again, unless it or one before it change
 
 import json
 import math
-import signal
 import sys
 import time
 from dataclasses import dataclass
@@ -119,7 +118,6 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     """The command line; `arguments` default to the process's own. Returns the exit status."""
     options = parse(Options, __doc__, arguments)
     start = time.monotonic()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the command that is under way ends too
     try:
         options.output.mkdir(parents=True, exist_ok=True)
         durations = run_stages(options.output, make_stages(options), options.force)

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections import deque
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Callable, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
@@ -89,7 +90,24 @@ def run_stages(folder: Path, stages: Sequence[Stage], force: bool = False) -> Li
     Raises:
         StageFailedError: a command failed; the stages before it stay finished.
         KeyboardInterrupt: Ctrl-C; the command that was under way had the time to save what it had.
+        SystemExit: SIGTERM or SIGHUP, which end that command too.
     """
+    with _ending_on(signal.SIGTERM, signal.SIGHUP):
+        return _run_all(folder, stages, force)
+
+
+@contextmanager
+def _ending_on(*signals: signal.Signals) -> Iterator[None]:
+    """Signals that would end this process at once end it so that its command ends, too."""
+    before = {number: signal.signal(number, lambda number, _: sys.exit(128 + number)) for number in signals}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _run_all(folder: Path, stages: Sequence[Stage], force: bool) -> List[Tuple[str, Optional[float]]]:
     finished = [stage.is_finished(folder) and not force for stage in stages]
     first = finished.index(False) if False in finished else len(stages)
     durations: List[Tuple[str, Optional[float]]] = []
@@ -194,7 +212,10 @@ def run_command(
             pass_on()
         except KeyboardInterrupt:
             process.send_signal(signal.SIGINT)
-            pass_on()
+            try:
+                pass_on()
+            except KeyboardInterrupt:  # a second one: at once
+                process.terminate()
             raise
         except BaseException:
             process.terminate()

@@ -1,5 +1,6 @@
 """Stages run once, in their order, with one bar for all; what a command prints and how it ends isn't lost."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -162,3 +163,22 @@ def test_ctrl_c_reaches_the_command_once_and_waits_until_it_has_saved(tmp_path):
     assert b"KeyboardInterrupt" in errors
     assert (tmp_path / "saved").read_text() == "1"
     assert not (tmp_path / FINISHED / "slow").exists()
+
+
+def test_a_command_ends_with_what_it_was_started_by(tmp_path):
+    child = (
+        f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); print('ready'); time.sleep(60)"
+    )
+    code = (
+        "from pathlib import Path\n"
+        "from sparsestyle_ns.utils.stages import Stage, run_stages\n"
+        f"run_stages(Path({str(tmp_path)!r}), [Stage('slow', 'Waiting', [['python', '-c', {child!r}]], 'saved')])\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
+        for line in process.stdout:
+            if line.split()[1:] == [b"ready"]:
+                break
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=30) == 143
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "pid").read_text()), 0)
