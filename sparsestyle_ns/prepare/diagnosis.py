@@ -302,14 +302,25 @@ def no_depth(seen: Comparison) -> List[str]:
 
 def left_out(seen: Comparison, placed: Sequence[int]) -> List[str]:
     """Why photos have no pose, in sentences; `placed` are those that have one."""
+    if not placed:
+        weakest = min(range(len(seen.names)), key=lambda photo: _best_link(seen, photo))
+        count = _best_link(seen, weakest)
+        return [
+            f"{seen.names[weakest]} shares too little with the other photos (at most {count} matches that fit "
+            f"together, which don't settle where it was taken); {next_photo(seen, {weakest})}"
+        ]
     missing = {photo for photo in range(len(seen.names)) if photo not in placed}
     apart = {photo for group in seen.groups()[1:] for photo in group}
     sentences = unlinked(seen) if apart & missing else []
     if missing - apart:
-        near = seen.names[next((photo for photo in placed), 0)]
         sentences.append(
             f"{_listed(seen, missing - apart)} can't be placed, as no camera sees all that matches there: that may be "
             "another zoom, things that moved, or one thing that is there more than once; take it again a step beside "
-            f"{near}, without zoom, when nothing moves."
+            f"where {seen.names[placed[0]]} was taken, without zoom, when nothing moves."
         )
     return sentences
+
+
+def _best_link(seen: Comparison, photo: int) -> int:
+    """The most matches that a photo shares with another one."""
+    return max(link.agreeing for pair, link in seen.links.items() if photo in pair)

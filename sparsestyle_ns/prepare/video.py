@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from sparsestyle_ns.data.features import Features, find_features, mutual_matches
-from sparsestyle_ns.prepare.diagnosis import sharpness
+from sparsestyle_ns.prepare.diagnosis import BLURRED, sharpness
 from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Photo
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress import bar, track
@@ -77,8 +77,9 @@ def _sharpest_frames(video: Path) -> List[_Frame]:
     try:
         total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
         rate = reader.get(cv2.CAP_PROP_FPS) or 30.0
-        best: List[Optional[_Frame]] = [None] * WINDOWS
-        step = max(1, total // (WINDOWS * LOOKED_AT))
+        windows = max(1, min(WINDOWS, total // LOOKED_AT))
+        best: List[Optional[_Frame]] = [None] * windows
+        step = max(1, total // (windows * LOOKED_AT))
         with bar("Reading the video", max(total, 2)) as progress:
             for number in range(total):
                 if not reader.grab():
@@ -86,13 +87,15 @@ def _sharpest_frames(video: Path) -> List[_Frame]:
                 progress.advance()
                 if number % step:
                     continue
-                window = min(WINDOWS - 1, number * WINDOWS // total)
+                window = min(windows - 1, number * windows // total)
                 frame = _read_frame(reader, number, rate)
                 if frame is not None and (best[window] is None or frame.sharpness > best[window].sharpness):
                     best[window] = frame
     finally:
         reader.release()
-    frames = [frame for frame in best if frame is not None]
+    found = [frame for frame in best if frame is not None]
+    usual = float(np.median([frame.sharpness for frame in found])) if found else 0.0
+    frames = [frame for frame in found if frame.sharpness >= BLURRED * usual]
     if len(frames) < MIN_PHOTOS:
         raise InputError(f"{video} can't be read as a video of at least {MIN_PHOTOS} frames; save it as MP4 (H.264).")
     return frames
