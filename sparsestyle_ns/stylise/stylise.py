@@ -1,6 +1,6 @@
 """`sparsestyle stylise`: the stages from photos and a painting to pages.
 
-A run's folder carries a digest of what decides its outcome, so that what is in it may be used or gone on with.
+A scene's and a run's folder carry a digest of what decides their content, so that it may be used or gone on with.
 """
 
 import hashlib
@@ -53,9 +53,9 @@ class _Way:
     def __post_init__(self) -> None:
         options = self.options
         self.is_scene = is_scene(options.photos)
-        self.scene = options.photos.resolve() if self.is_scene else options.output / "scene"
-        self.outputs = options.output / "outputs"
         self.photos = digest(*scene_files(options.photos))
+        self.scene = options.photos.resolve() if self.is_scene else options.output / f"scene-{self.photos}"
+        self.outputs = options.output / "outputs"
         coarse = f"coarse-{digest(self.method(COARSE_METHOD), options.seed, options.device, self.photos)}"
         style = digest(coarse, hashlib.sha256(options.painting.read_bytes()).hexdigest())
         style = f"{safe_file_name(options.painting.stem, 'style')}-{style}"
@@ -106,13 +106,13 @@ class _Way:
 
     def export(self) -> Command:
         """The page to fly through."""
-        return ["sparsestyle", "export", str(self.stylised), "--format", "html", "--output-path", str(self.scene_page)]
+        return ["sparsestyle", "export", str(self.stylised), "--output-path", str(self.scene_page)]
 
 
 def make_stages(options: StyliseOptions) -> List[Stage]:
     """What has to be done, as commands; those that train say at their turn whether they begin or go on."""
     way = _Way(options)
-    prepare = Stage("scene", "A scene of the photos", [way.prepare()], "scene/*", way.photos, seconds=20.0)
+    prepare = Stage("scene", "A scene of the photos", [way.prepare()], f"{way.scene.name}/*", seconds=20.0)
     coarse, stylised = (f"{run.relative_to(options.output)}/config.yml" for run in (way.coarse, way.stylised))
     films = {"Views": 0.1, "Filming": 0.3}
     stages = [
@@ -133,7 +133,7 @@ def is_scene(folder: Path) -> bool:
 def scene_files(folder: Path) -> List[str]:
     """What tells a scene's files from others: names, sizes, and how they begin and end."""
     found = []
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+    for path in [folder] if folder.is_file() else sorted(path for path in folder.rglob("*") if path.is_file()):
         with path.open("rb") as file:
             ends = file.read(SHARE_READ)
             file.seek(max(0, path.stat().st_size - SHARE_READ))

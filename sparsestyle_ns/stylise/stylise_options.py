@@ -19,7 +19,7 @@ class StyliseOptions(CommandOptions):
     """
 
     photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]
-    """Folder of three to eight photos, or of a scene that ns-train reads."""
+    """Folder of three to eight photos, a video, or the folder of a scene that ns-train reads."""
     painting: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PAINTING")]
     """The painting: a JPEG, PNG or WebP file."""
     output: Path
@@ -33,7 +33,7 @@ class StyliseOptions(CommandOptions):
 
     def check(self) -> None:
         """Raises an `InputError` where photos or painting aren't there, or the folder can't be made."""
-        if not self.photos.is_dir():
+        if not self.photos.exists():
             raise InputError(f"There is no folder {self.photos}; name the folder of the photos.")
         if not self.painting.is_file():
             raise InputError(f"There is no painting {self.painting}; name a JPEG, PNG or WebP file.")

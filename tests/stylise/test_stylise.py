@@ -89,15 +89,17 @@ def test_it_is_five_commands(photos, painting, monkeypatch, capsys):
     assert recorded.kinds == WHOLE
     prepare, coarse, style, gallery, export = map(shlex.join, recorded.commands)
     out = photos.parent / "out"
-    assert prepare == f"sparsestyle prepare {photos} --output {out / 'scene'}"
-    assert coarse.startswith(f"ns-train coarse-fewshot --data {out / 'scene'} --output-dir {out / 'outputs'}")
+    scene = Path(prepare.split()[-1])
+    assert prepare == f"sparsestyle prepare {photos} --output {scene}"
+    assert scene.parent == out and scene.name.startswith("scene-")
+    assert coarse.startswith(f"ns-train coarse-fewshot --data {scene} --output-dir {out / 'outputs'}")
     assert coarse.endswith(" nerfstudio-data")
     run = Path(style.split("--coarse-run ")[1].split()[0])
-    assert run.parent == out / "outputs" / "scene" / "coarse-fewshot" and f"--timestamp {run.name}" in coarse
+    assert run.parent == out / "outputs" / scene.name / "coarse-fewshot" and f"--timestamp {run.name}" in coarse
     assert f"--style-image {painting}" in style
     stylised = Path(gallery.split()[2])
     assert stylised.name.startswith("hat-") and f"--timestamp {stylised.name}" in style
-    assert export.startswith(f"sparsestyle export {stylised} --format html --output-path {out / 'scene.html'}")
+    assert export.startswith(f"sparsestyle export {stylised} --output-path {out / 'scene.html'}")
     assert capsys.readouterr().out.splitlines()[-1].startswith(f"Made {out / 'index.html'} – next: ")
 
 
@@ -142,11 +144,11 @@ def test_a_run_that_was_interrupted_is_gone_on_with(photos, painting, monkeypatc
     recorded = Recorded(monkeypatch)
     stylise(monkeypatch, photos, painting)
     out = photos.parent / "out"
-    (run,) = out.glob("outputs/scene/coarse-fewshot/*")
+    (run,) = out.glob("outputs/scene-*/coarse-fewshot/*")
     (run / "nerfstudio_models" / "step-000000009.ckpt").rename(run / "nerfstudio_models" / "step-000000004.ckpt")
     (out / ".finished" / "coarse").unlink()
     for method in ("coarse-fewshot", "hier-style"):
-        (config,) = out.glob(f"outputs/scene/{method}/*/config.yml")
+        (config,) = out.glob(f"outputs/scene-*/{method}/*/config.yml")
         config.write_text(yaml.dump(replace(method_config(method), max_num_iterations=10)))
     recorded = Recorded(monkeypatch)
     stylise(monkeypatch, photos, painting)
@@ -167,9 +169,16 @@ def test_other_photos_begin_anew(photos, painting, monkeypatch):
     Recorded(monkeypatch)
     stylise(monkeypatch, photos, painting)
     Image.new("RGB", (40, 30), (1, 2, 3)).save(photos / "1.png")
-    first, second, *_ = make_stages(options(photos, painting))
-    out = photos.parent / "out"
-    assert not first.is_finished(out) and not second.is_finished(out)
+    recorded = Recorded(monkeypatch)
+    stylise(monkeypatch, photos, painting)
+    assert recorded.kinds == WHOLE
+    assert len(list((photos.parent / "out").glob("scene-*"))) == 2
+
+
+def test_a_video_is_prepared(tmp_path, painting):
+    (tmp_path / "walk.mp4").write_bytes(b"frames")
+    first, *_ = commands_of(StyliseOptions(tmp_path / "walk.mp4", painting, tmp_path / "out"))
+    assert first.startswith(f"sparsestyle prepare {tmp_path / 'walk.mp4'} --output ")
 
 
 def test_a_command_that_fails_says_why_and_how_to_go_on(photos, painting, monkeypatch, capsys):
