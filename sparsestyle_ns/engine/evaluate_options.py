@@ -44,10 +44,10 @@ class EvaluateOptions(CommandOptions):
         needs_style = self.baked or self.style_image is not None
         config = find_config(self.run, STYLE_METHOD if needs_style else "")
         if self.output_path is None:
+            other = "painting" if self.style_image is not None else "scene"
             if self.style_image is not None or self.known_scene is not None:
                 raise InputError(
-                    f"{REPORT_FILE} in the run's folder is for its own painting and scene; name a file with "
-                    "--output-path."
+                    f"{REPORT_FILE} in the run's folder is for its own {other}; name a file with --output-path."
                 )
             self.output_path = config.parent / REPORT_FILE
         prepare_output(self.output_path, "The report", "report.json")  # measuring takes minutes
