@@ -7,8 +7,8 @@ from typing import Any, List, Sequence, Tuple
 from PIL import ExifTags, Image
 
 DIAGONAL_35MM, WIDTH_35MM = 43.27, 36.0
-"""Millimetres of a picture on 35 mm film. Equivalent focal lengths keep the angle of the diagonal by the standard, of the
-longer side by some makers' and programs' way; of 4:3 photos these are 4% apart."""
+"""Millimetres of a picture on 35 mm film. Equivalent focal lengths keep the angle of the diagonal by the standard, that
+of the longer side as some have it; of 4:3 photos these are 4% apart."""
 MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}
 """Of the unit that resolution in the focal plane is given in: inch, centimetre, millimetre."""
 SHORTEST, LONGEST = 0.2, 20.0
