@@ -38,8 +38,8 @@ their own must lower the error, for that to be believed. Zoomed photos lowered i
 MIN_GAIN = 0.05
 """Share by which a lens's distortion must lower the squared error to be believed."""
 CORRELATED = 8.0
-"""Observations whose errors are as one: so much larger than by their number the variance of focal lengths was, in 60
-sets of three to eight photos."""
+"""Observations whose errors count as one, since features near each other share theirs. In 34 sets of three to eight
+photos the variance of focal lengths was 3 times what independent errors explain, in those of fern 5 times."""
 STEP, STEPS = 0.1, 6
 """Factors by which focal lengths are tried about those that fit best: the step of their logarithms, and steps to either
 side."""
