@@ -15,7 +15,15 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-from sparsestyle_ns.data.features import Features, Pair, PhotoMatches, find_features, linked_groups, mutual_matches
+from sparsestyle_ns.data.features import (
+    Features,
+    Pair,
+    PhotoMatches,
+    find_features,
+    guided_matches,
+    linked_groups,
+    mutual_matches,
+)
 from sparsestyle_ns.prepare.framing import MIN_PHOTOS
 from sparsestyle_ns.utils.progress import track
 
@@ -56,6 +64,7 @@ class Link:
         matched: all matched features.
         turn: how far the homography is from a mere turn of the camera; infinite where too few agree.
         flat: share of the agreeing ones that a homography explains.
+        fundamental: the epipolar geometry; None where too few agree.
         epipole: where the second camera lies in the first photo, as an offset from the middle in longer sides; None
             where too few agree.
     """
@@ -66,6 +75,7 @@ class Link:
     rows: Int[np.ndarray, "2 agreeing"] = field(default_factory=lambda: np.zeros((2, 0), int))
     matched: Int[np.ndarray, "2 matches"] = field(default_factory=lambda: np.zeros((2, 0), int))
     epipole: Optional[Float[np.ndarray, "2"]] = None
+    fundamental: Optional[Float[np.ndarray, "3 3"]] = None
 
     @property
     def linked(self) -> bool:
@@ -98,6 +108,15 @@ class Comparison:
         """The matches that agree on a geometry, of the photos that have enough of them."""
         pairs = {pair: link.rows for pair, link in self.links.items() if link.linked}
         return PhotoMatches([each.points for each in self.features], pairs)
+
+    def guided(self) -> PhotoMatches:
+        """More of them: matched anew along the epipolar lines that these tell of."""
+        pairs = {}
+        for pair, link in self.links.items():
+            if link.has_depth:
+                first, second = (self.features[photo] for photo in pair)
+                pairs[pair] = guided_matches(first, second, link.fundamental, EPIPOLAR_ERROR)
+        return PhotoMatches(self.matches.points, {**self.matches.pairs, **pairs})
 
     def groups(self) -> List[Set[int]]:
         """Photos that are linked to each other, directly or by way of others; the largest group first."""
@@ -151,7 +170,7 @@ def compare_photos(first: Features, second: Features, shape: Sequence[int]) -> L
     point = homogeneous[:2] / (homogeneous[2] if abs(homogeneous[2]) > 1e-12 else 1e-12)
     epipole = (point - middle) / max(shape)
     turn = np.inf if warp is None else _distance_from_turn(warp, middle, max(shape))
-    return Link(int(agree.sum()), flat, turn, matched[:, agree], matched, epipole)
+    return Link(int(agree.sum()), flat, turn, matched[:, agree], matched, epipole, matrix)
 
 
 def _distance_from_turn(warp: Float[np.ndarray, "3 3"], middle: Float[np.ndarray, "2"], longer: int) -> float:

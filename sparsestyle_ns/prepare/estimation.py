@@ -120,8 +120,13 @@ def estimate_poses(photos: Sequence[Photo], framings: Sequence[Framing], seen: C
     lenses, lens_of = shared_lenses([(photo.exif, photo.image.size) for photo in photos])
     height, width = seen.greys[0].shape
     longer = max(framings[0].scaled) * width / framings[0].size[0]
-    with bar("Estimating poses", num_steps(lenses)) as progress:
+    with bar("Estimating poses", 2 * num_steps(lenses)) as progress:
         found = reconstruct(seen.matches, (width, height), longer, lenses, lens_of, progress.advance)
+        if found is None or len(found.photos) < len(photos):
+            more = reconstruct(seen.guided(), (width, height), longer, lenses, lens_of, progress.advance)
+            if more is not None and (found is None or len(more.photos) > len(found.photos)):
+                found = more
+        progress.reach(2 * num_steps(lenses))
     if found is None:
         raise InputError(f"Where the photos were taken can't be told. {' '.join(reasons or left_out(seen, ()))}")
     if len(found.photos) < len(photos):

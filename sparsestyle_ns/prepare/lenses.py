@@ -1,19 +1,20 @@
 """What EXIF says of a photo's lens, and which photos were taken with one and the same."""
 
+import math
 from dataclasses import dataclass
-from typing import Any, List, Optional, Sequence, Tuple
+from typing import Any, List, Sequence, Tuple
 
-import numpy as np
 from PIL import ExifTags, Image
 
-DIAGONAL_35MM = 43.27
-"""Millimetres across a picture of 35 mm film, 36 × 24 mm; equivalent focal lengths keep the diagonal's angle."""
+DIAGONAL_35MM, WIDTH_35MM = 43.27, 36.0
+"""Millimetres of a picture on 35 mm film. Equivalent focal lengths keep the angle of the diagonal by the standard, that
+of the longer side as some have it; of 4:3 photos these are 4% apart."""
 MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}
 """Of the unit that resolution in the focal plane is given in: inch, centimetre, millimetre."""
 SHORTEST, LONGEST = 0.2, 20.0
 """Focal lengths, in longer sides of the photo, that EXIF may give; others are slips."""
-EXIF_SPREAD = 0.05
-"""Standard deviation of a focal length by EXIF, in logarithms: it is rounded, and of a picture cut to another shape."""
+EXIF_SPREAD = 0.025
+"""Standard deviation of a focal length by EXIF, in logarithms: it is rounded, and changes a little with focus."""
 USUAL_FOCAL, USUAL_SPREAD = 0.9, 0.35
 """Focal length where EXIF says nothing: the mean and standard deviation of logarithms. A telephone's main camera has
 0.7 to 0.85 longer sides, its wide one half of that; other cameras mostly have 0.8 to 2."""
@@ -24,14 +25,18 @@ class Lens:
     """A lens at one zoom.
 
     Attributes:
-        focal: its focal length, in longer sides of a whole photo.
-        spread: how far off that may be, as a standard deviation of its logarithm.
+        focals: what its focal length may be, in longer sides of a whole photo; the likeliest first.
+        spread: how far off one of these is, as a standard deviation of its logarithm.
         known: whether EXIF gives it.
     """
 
-    focal: float = USUAL_FOCAL
+    focals: Tuple[float, ...] = (USUAL_FOCAL,)
     spread: float = USUAL_SPREAD
     known: bool = False
+
+    def improbability(self, focal: float) -> float:
+        """Of a focal length in longer sides: the negative logarithm of its probability, up to a constant."""
+        return min(0.5 * (math.log(focal / one) / self.spread) ** 2 for one in self.focals)
 
 
 def shared_lenses(photos: Sequence[Tuple[Image.Exif, Tuple[int, int]]]) -> Tuple[List[Lens], List[int]]:
@@ -51,24 +56,27 @@ def shared_lenses(photos: Sequence[Tuple[Image.Exif, Tuple[int, int]]]) -> Tuple
 
 
 def _lens(photos: Sequence[Tuple[Image.Exif, Tuple[int, int]]]) -> Lens:
-    focals = [focal for exif, size in photos if (focal := exif_focal(exif, size)) is not None]
-    return Lens(float(np.median(focals)), EXIF_SPREAD, known=True) if focals else Lens()
+    found = [focals for exif, size in photos if (focals := exif_focals(exif, size))]
+    return Lens(found[0], EXIF_SPREAD, known=True) if found else Lens()
 
 
-def exif_focal(exif: Image.Exif, size: Tuple[int, int]) -> Optional[float]:
-    """The focal length in longer sides: of 35 mm film, else from that in millimetres and the sensor's size; None where
-    EXIF has neither."""
+def exif_focals(exif: Image.Exif, size: Tuple[int, int]) -> Tuple[float, ...]:
+    """What EXIF says that the focal length may be, in longer sides; nothing where it doesn't tell.
+
+    From that in millimetres and the sensor's size, else from that of 35 mm film, by the diagonal and by the longer
+    side.
+    """
     more, longer = exif.get_ifd(ExifTags.IFD.Exif), max(size)
     equivalent = _number(more, ExifTags.Base.FocalLengthIn35mmFilm)
-    if equivalent:
-        focal = equivalent / DIAGONAL_35MM * float(np.hypot(*size)) / longer
-    else:
-        millimetres = _number(more, ExifTags.Base.FocalLength)
-        resolution = _number(more, ExifTags.Base.FocalPlaneXResolution)
-        unit = MILLIMETRES.get(int(_number(more, ExifTags.Base.FocalPlaneResolutionUnit) or 2), 25.4)
-        whole = [_number(more, side) for side in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
-        focal = millimetres * resolution / unit / max(*(side or 0.0 for side in whole), 0.0 if all(whole) else longer)
-    return focal if SHORTEST < focal < LONGEST else None
+    unit = MILLIMETRES.get(int(_number(more, ExifTags.Base.FocalPlaneResolutionUnit) or 2), 25.4)
+    sides = [_number(more, side) for side in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    pixels = max(sides) if all(sides) else longer
+    exact = (
+        _number(more, ExifTags.Base.FocalLength) * _number(more, ExifTags.Base.FocalPlaneXResolution) / unit / pixels
+    )
+    by_diagonal = equivalent / DIAGONAL_35MM * math.hypot(*size) / longer
+    focals = (exact,) if exact else (by_diagonal, equivalent / WIDTH_35MM)
+    return tuple(focal for focal in focals if SHORTEST < focal < LONGEST)
 
 
 def _marks(exif: Image.Exif) -> Tuple[Any, ...]:
