@@ -34,7 +34,7 @@ class CoarseFewShotPipelineConfig(CheckedPipelineConfig):
     _target: Type = field(default_factory=lambda: CoarseFewShotPipeline)
     model: ModelConfig = field(default_factory=CoarseFewShotModelConfig)
     """The coarse field and how it is trained."""
-    reprojection_weight: float = 1e-3
+    reprojection_weight: float = 1e-2
     """Weight of the distance, in pixels, by which rays to matched points miss each other, where cameras are refined."""
     semantic_weight: float = 0.0
     """Weight of the semantic loss (DietNeRF's, with VGG-16 for CLIP; 0.1 there): views between the photos must look
