@@ -19,6 +19,8 @@ from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import safe_file_name
 from sparsestyle_ns.utils.stages import Command, Stage, StageFailedError, clock, run_stages
 
+SECONDS = {"default": (15.0, 190.0, 290.0, 100.0, 80.0), "draft": (5.0, 65.0, 60.0, 40.0, 30.0)}
+"""What the commands take, about, on two idle cores; the bar needs their ratios."""
 SHARE_READ = 1 << 16
 """Bytes of a photo at its beginning, and at its end, that tell it from others."""
 
@@ -111,15 +113,17 @@ class _Way:
 
 def make_stages(options: StyliseOptions) -> List[Stage]:
     """What has to be done, as commands; those that train say at their turn whether they begin or go on."""
-    way = _Way(options)
-    prepare = Stage("scene", "A scene of the photos", [way.prepare()], f"{way.scene.name}/*", seconds=20.0)
+    way, seconds = _Way(options), SECONDS[options.methods]
+    prepare = Stage("scene", "A scene of the photos", [way.prepare()], f"{way.scene.name}/*", seconds=seconds[0])
     coarse, stylised = (f"{run.relative_to(options.output)}/config.yml" for run in (way.coarse, way.stylised))
     films = {"Views": 0.1, "Filming": 0.3}
     stages = [
-        Stage("coarse", "Stage 1: the scene from a few photos", way.learn, coarse, coarse, 190.0, {"Stage 1": 0.0}),
-        Stage("stylised", "Stage 2: the painting's style", way.paint, stylised, stylised, 290.0, {"Stage 2": 0.1}),
-        Stage("gallery", "A page of pictures", [way.show()], way.gallery_page.name, seconds=100.0, works=films),
-        Stage("export", "A page to fly through", [way.export()], way.scene_page.name, seconds=80.0),
+        Stage(
+            "coarse", "Stage 1: the scene from a few photos", way.learn, coarse, coarse, seconds[1], {"Stage 1": 0.0}
+        ),
+        Stage("stylised", "Stage 2: the painting's style", way.paint, stylised, stylised, seconds[2], {"Stage 2": 0.1}),
+        Stage("gallery", "A page of pictures", [way.show()], way.gallery_page.name, seconds=seconds[3], works=films),
+        Stage("export", "A page to fly through", [way.export()], way.scene_page.name, seconds=seconds[4]),
     ]
     return stages if way.is_scene else [prepare, *stages]
 
