@@ -30,7 +30,8 @@ from sparsestyle_ns.utils.progress import track
 COMPARED_SIDE = 1000
 """Pixels along the longer side of the pictures that are compared, at most."""
 MIN_FEATURES = 300
-"""Features of a photo below which it is blurred, or shows plain surfaces."""
+"""Features of a photo of that size below which it is blurred, or shows plain surfaces; of smaller ones fewer, with the
+root of their side."""
 MIN_MATCHES = 20
 """Matches that agree on one geometry, below which two photos count as sharing nothing: of photos of different things up
 to 16 agreed."""
@@ -202,10 +203,10 @@ def repeated_share(found: Features) -> float:
 
 def _faint(seen: Comparison) -> List[str]:
     sharp = [sharpness(grey) for grey in seen.greys]
-    usual = float(np.median(sharp))
+    usual, fewest = float(np.median(sharp)), MIN_FEATURES * np.sqrt(max(seen.greys[0].shape) / COMPARED_SIDE)
     sentences = []
     for name, found, contrast in zip(seen.names, seen.features, sharp, strict=True):
-        if len(found) < MIN_FEATURES:
+        if len(found) < fewest:
             sentences.append(
                 f"{name} has only {len(found)} features that can be found again: it is blurred, dark, or shows plain "
                 "surfaces; take it again, sharp and with something textured in it."

@@ -61,7 +61,7 @@ def errors(scene: Path, source: Path, chosen) -> dict:
     return {**degrees_off(found.camera_to_worlds.numpy(), poses), "focal": float(focals[0] / focals[1] - 1.0)}
 
 
-@pytest.mark.parametrize("count", [3, 5, 8])
+@pytest.mark.parametrize("count", [3, 5, pytest.param(8, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("with_exif", [False, True])
 def test_sample_photos_are_placed_where_they_were_taken(tmp_path, sample, count, with_exif):
     photos = copy_photos(sample, tmp_path / "photos", SPLITS[count])
@@ -76,7 +76,7 @@ def test_sample_photos_are_placed_where_they_were_taken(tmp_path, sample, count,
 
 
 @pytest.mark.skipif(not FERN.is_dir(), reason="fern isn't below SPARSESTYLE_DATA")
-@pytest.mark.parametrize("count", [3, 5, 8])
+@pytest.mark.parametrize("count", [3, 5, pytest.param(8, marks=pytest.mark.slow)])
 def test_fern_is_placed_as_it_is_known(tmp_path, count):
     """Its known poses are themselves found from photos, and its lens is not quite straight."""
     photos = copy_photos(FERN, tmp_path / "photos", SPLITS[count], "images_8")
