@@ -4,7 +4,6 @@ A subcommand is a class of options, whose docstrings are its help, and a functio
 """
 
 import importlib
-import sys
 from typing import Dict, Optional, Sequence, Tuple, Type
 
 import tyro
@@ -15,6 +14,7 @@ from sparsestyle_ns.gallery.gallery_options import GalleryOptions
 from sparsestyle_ns.prepare.prepare_options import EffectsOptions, PrepareOptions
 from sparsestyle_ns.studies.study_options import AblateOptions, CompareOptions, TradeoffOptions
 from sparsestyle_ns.utils.errors import CommandOptions, exit_on_input_error
+from sparsestyle_ns.utils.interrupts import end_on_ctrl_c, ended_by_ctrl_c
 
 SUBCOMMANDS: Dict[str, Tuple[Type[CommandOptions], str]] = {
     "ablate": (AblateOptions, "studies.paper_studies:ablate"),
@@ -32,7 +32,9 @@ SUBCOMMANDS: Dict[str, Tuple[Type[CommandOptions], str]] = {
 @exit_on_input_error
 def main(arguments: Optional[Sequence[str]] = None) -> None:
     """The command line; `arguments` default to the process's own."""
-    try:
+    if arguments is None:
+        end_on_ctrl_c()
+    with ended_by_ctrl_c():
         options: CommandOptions = tyro.extras.subcommand_cli_from_dict(
             {name: options for name, (options, _) in SUBCOMMANDS.items()},
             prog="sparsestyle",
@@ -42,6 +44,3 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
         options.check()
         module, function = dict(SUBCOMMANDS.values())[type(options)].split(":")
         getattr(importlib.import_module(f"sparsestyle_ns.{module}"), function)(options)
-    except KeyboardInterrupt:
-        print("Stopped by Ctrl-C.", file=sys.stderr)
-        raise SystemExit(130) from None

@@ -26,6 +26,7 @@ from sparsestyle_ns.runs.run_folder import COARSE_METHOD
 from sparsestyle_ns.runs.scene_record import record_scene, save_thumbnail
 from sparsestyle_ns.utils.distributed import from_first_process
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
+from sparsestyle_ns.utils.interrupts import stop
 from sparsestyle_ns.utils.machine import release_memory
 from sparsestyle_ns.utils.progress import bar
 
@@ -156,8 +157,10 @@ class HierStyleTrainer(SparseStyleTrainer):
         trainer = config.setup(local_rank=self.local_rank, world_size=self.world_size)
         trainer.setup()
         if not trainer.train_to_end():
+            if trainer.step + 1 == config.max_num_iterations:
+                stop("Stopped by Ctrl-C; the coarse run is finished, and this command, run again, stylises it.")
             resume = ["ns-train", config.method_name, "--load-dir", str(trainer.checkpoint_dir)]
-            raise InputError(
+            stop(
                 "The coarse run was interrupted, so there is nothing to stylise yet; finish it with "
                 f"{shlex.join([*resume, *scene_arguments(config)])} and run this command again."
             )

@@ -1,7 +1,9 @@
 """nerfstudio's trainer, made to keep what it has: whole checkpoints, also on Ctrl-C, and resuming where it stopped."""
 
 import functools
+import os
 import signal
+import time
 import warnings
 from abc import ABC, abstractmethod
 from contextlib import ExitStack
@@ -27,15 +29,20 @@ from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.runs import checkpoints
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path
+from sparsestyle_ns.runs.run_folder import remove_empty_run
 from sparsestyle_ns.runs.scene_record import record_scene
 from sparsestyle_ns.utils.distributed import any_process, prepare_launch, share_state
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.files import write_whole
-from sparsestyle_ns.utils.progress import bar
+from sparsestyle_ns.utils.interrupts import StoppedByCtrlC, stop, take_away_at_end
+from sparsestyle_ns.utils.progress import bar, say
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 
 STEPS_PER_LOOK = 10
 """Iterations between looks at the count of skipped steps, each of which waits for a GPU."""
+
+SECONDS_OF_ONE_PRESS = 1.0
+"""Ctrl-C that comes again within so long is the same one: pressed twice, or passed on by the process above."""
 
 warnings.filterwarnings("ignore", message="Using a non-tuple sequence", module="nerfstudio")
 warnings.filterwarnings("ignore", message="Sparse invariant checks are implicitly disabled")
@@ -74,6 +81,8 @@ class SparseStyleTrainerConfig(TrainerConfig):
             )
         if machine.num_devices * machine.num_machines > 1:
             prepare_launch()
+        if not folder.exists():
+            take_away_at_end(lambda: remove_empty_run(folder))
         try:
             write_whole(folder / "config.yml", yaml.dump(self))
         except OSError as error:
@@ -154,21 +163,24 @@ class SparseStyleTrainer(Trainer, ABC):
 
     @exit_on_input_error
     def train(self) -> None:
-        """Trains, and says what was made and what to type next."""
+        """Trains, and says what was made and what to type next; after Ctrl-C it ends the process, with status 130."""
         self.train_to_end()
         self.finish()
+        if self._interrupted:
+            raise StoppedByCtrlC
 
     def train_to_end(self) -> bool:
         """Trains up to `max_num_iterations`, counted from the very first iteration, also when resuming.
 
         Ctrl-C ends training after the iteration that is under way and saves a checkpoint; a second one stops at once.
-        Returns whether training came to its end.
+        Returns whether nobody pressed it.
         """
         total = self.config.max_num_iterations
         if self._start_step >= total:
             done = f"The checkpoint is of iteration {self._start_step}"
             raise InputError(f"{done}, and --max-num-iterations is {total}; raise it to train on.")
-        self._interrupted = False
+        self._interrupted = self._waits = False
+        self._interrupted_at: Optional[float] = None
         former = signal.signal(signal.SIGINT, self._on_interrupt)
         has_table = self.config.logging.local_writer.enable  # nerfstudio's, which would write over the bar
         shown = bar(self.stage, total, self._start_step, "iterations", visible=not has_table)
@@ -178,7 +190,7 @@ class SparseStyleTrainer(Trainer, ABC):
                 super().train()
         except TrainingInterruptedError:
             self.save_checkpoint(self.step)
-            CONSOLE.print(f"Stopped after iteration {self.step + 1} of {total}; the checkpoint is saved.")
+            say(f"Stopped after iteration {self.step + 1} of {total}; the checkpoint is saved.")
         finally:
             signal.signal(signal.SIGINT, former)
         return not self._interrupted
@@ -193,17 +205,28 @@ class SparseStyleTrainer(Trainer, ABC):
     def _train_complete_viewer(self) -> None:
         """The viewer stays until Ctrl-C, which ends the command as if there were none."""
         self.finish()
+        if self._interrupted:  # while the last checkpoint was saved
+            raise StoppedByCtrlC
+        self._waits = True
         try:
             super()._train_complete_viewer()
         except KeyboardInterrupt:
-            CONSOLE.print("The viewer is closed.")
+            say("The viewer is closed.")
 
     def _on_interrupt(self, number: int, frame: Optional[FrameType]) -> None:
-        if self._interrupted or self.training_state == "completed":
+        if self._waits:
             raise KeyboardInterrupt
+        if self._interrupted_at is not None and time.monotonic() - self._interrupted_at < SECONDS_OF_ONE_PRESS:
+            return
+        if self._interrupted:
+            kept = "nothing was saved" if self._kept_step is None else f"iteration {self._kept_step + 1} is saved"
+            stop(f"Stopped by Ctrl-C at once; {kept}.")
         self._interrupted = True
-        self.training_state = "training"  # one that the viewer paused goes on for an iteration
-        CONSOLE.print("Ctrl-C: finishing this iteration, then saving. Press it again to stop at once.")
+        if self.training_state == "paused":  # by the viewer; it goes on for an iteration
+            self.training_state = "training"
+        self._interrupted_at = time.monotonic()
+        if comms.is_main_process():  # not by Python's printing, which may be what is interrupted
+            os.write(1, b"\nCtrl-C: finishing this iteration, then saving. Press it again to stop at once.\n")
 
     def train_iteration(self, step: int) -> Tuple[Tensor, Dict[str, Tensor], Dict[str, Tensor]]:
         """One iteration: its loss, the losses by name, and metrics."""
@@ -258,7 +281,7 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def finish(self) -> None:
         """Prints the command's last line."""
-        if self._interrupted:
+        if self._interrupted and self.step + 1 < self.config.max_num_iterations:
             made = f"{self.base_dir}, up to iteration {self.step + 1} of {self.config.max_num_iterations}"
             finish(made, resume_command(self.config.method_name, self.checkpoint_dir))
         else:
