@@ -15,7 +15,6 @@ from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.prepare.prepare_options import EffectsOptions
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
 from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD
-from sparsestyle_ns.runs.scene_record import record_scene
 from sparsestyle_ns.style.painting import Painting
 
 
@@ -53,7 +52,7 @@ def measure_scene(dataparser: DataParserConfig, options: EffectsOptions) -> Deci
     effects = decide(scene, EffectSettings())
     if options.coarse_run is not None:
         run = read_coarse_run(options.coarse_run)
-        check_scene(run, record_scene(options.data, manager.train_dataparser_outputs, effects))
+        check_scene(run, manager.record(effects))
         scene.coarse_density = run.density(effects)
     if options.style_image is not None:
         scene.style_image = Painting.read(options.style_image).pixels

@@ -272,7 +272,7 @@ def check_options(options: StudyOptions) -> PaperRuns:
         raise InputError(f"--jobs is {options.jobs}; at least one run at a time is needed.")
     for painting in options.style_images:
         Painting.read(painting)
-    prepare_output(options.output_path, "The page", "index.html")
+    prepare_output(options.output_path, "The page", "index.html", options.force)
     named = ("draft", "max_image_side", "coarse_iterations", "style_iterations")
     flags = {name: tuple(shlex.split(getattr(options, name))) for name in ("coarse_flags", "style_flags")}
     study = Study(options.data, dataparser, **{name: getattr(options, name) for name in named}, **flags)

@@ -8,7 +8,15 @@ R = TypeVar("R")
 
 
 class InputError(ValueError):
-    """Something the user gave cannot be used. The message is one sentence: what is wrong, where, and what to do."""
+    """Something the user gave cannot be used. The message is one sentence: what is wrong, where, and what to do.
+
+    Attributes:
+        fault: the sentence without `advice`, which is kept apart where it names flags that not all commands have.
+    """
+
+    def __init__(self, fault: str, advice: str = "") -> None:
+        super().__init__(f"{fault}: {advice}." if advice else fault)
+        self.fault = fault.removesuffix(".")
 
 
 class CommandOptions:
