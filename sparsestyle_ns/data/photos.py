@@ -121,14 +121,14 @@ def _check_content(path: Path, pixels: UInt8[np.ndarray, "H W channels"]) -> Non
     height, width, channels = pixels.shape
     if min(height, width) < SMALLEST_SIDE:
         raise InputError(
-            f"{path} is {width}x{height} pixels, but at least {SMALLEST_SIDE} a side are needed: replace it, or choose "
-            "other views with --view-ids."
+            f"{path} is {width}x{height} pixels, but at least {SMALLEST_SIDE} a side are needed: replace it, or take "
+            "it and its pose out of the scene."
         )
     opaque = channels == 3 or pixels[..., 3].min() == 255
     nothing = pixels[..., :3].max() <= DARKEST if opaque else pixels[..., 3].max() == 0
     if nothing:
         kind = "black" if opaque else "transparent"
-        raise InputError(f"{path} is {kind} all over: replace it, or choose other views with --view-ids.")
+        raise InputError(f"{path} is {kind} all over: replace it, or take it and its pose out of the scene.")
 
 
 class PhotoDataset(InputDataset):

@@ -30,6 +30,8 @@ class EvaluateOptions(CommandOptions):
     """Painting to measure a stylised run against, if not the one it was made with; needs --output-path."""
     baked: bool = False
     """Also measure how close a stylised run's baked renders are to exact ones (PSNR in dB)."""
+    vgg_weights: Optional[Path] = None
+    """File with the weights of the feature network, where those that the run was made with aren't found."""
     force: bool = False
     """Write over the file that --output-path names, if there is one."""
 

@@ -44,17 +44,22 @@ def evaluate(options: EvaluateOptions) -> None:
     if options.style_image is not None:
         Painting.read(options.style_image)
     config = find_config(options.run)
-    report = evaluate_run(config, options.output_path, options.style_image, options.baked)
+    report = evaluate_run(config, options.output_path, options.style_image, options.baked, options.vgg_weights)
     for table in report_tables(report.means, len(report.views)):
         table.print()
     finish(options.output_path, after_evaluation(config.parent, stylised="content_ssim" in report.means))
 
 
 def evaluate_run(
-    config_path: Path, output_path: Path, style_image: Optional[Path] = None, baked: bool = False
+    config_path: Path,
+    output_path: Path,
+    style_image: Optional[Path] = None,
+    baked: bool = False,
+    vgg_weights: Optional[Path] = None,
 ) -> HeldOutReport:
     """Loads a run and writes its `CheckedPipeline.held_out_report`; InputError where it has no checkpoint."""
     run = load_run(config_path)
+    run.pipeline.config.vgg_weights = vgg_weights or run.pipeline.config.vgg_weights
     report = run.pipeline.held_out_report(style_image, baked)
     run.save_report(report, output_path)
     return report

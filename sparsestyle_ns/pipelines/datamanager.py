@@ -137,7 +137,10 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
 
     def _chosen_views(self, parser: DataParser) -> DataparserOutputs:
         outputs = read_scene(parser)
-        info, asked = scene_info(outputs), (self.config.num_views, self.config.view_ids)
+        info, asked, expected = scene_info(outputs), (self.config.num_views, self.config.view_ids), self.config.expected
+        gone = [] if expected is None else [view for view in expected.record.view_ids if view not in info.view_ids]
+        if gone:
+            raise InputError(f"it was trained on views {', '.join(map(str, gone))}, too, which aren't there any more")
         chosen = select_views(info.view_ids, *asked, info.default_num_views, info.standard_views)
         selected = select_outputs(outputs, chosen)
         if has_one_size(outputs.cameras):

@@ -195,7 +195,13 @@ class HierStylePipeline(CheckedPipeline):
         if path is None or not path.is_file():
             say(f"The painting {path} isn't there any more, so nothing is measured against it.")
             return None
-        painting, backbone = replace(self.config, style_image=path).load_style()
+        try:
+            painting, backbone = replace(self.config, style_image=path).load_style()
+        except InputError as error:
+            if style_image is not None:  # which was asked for
+                raise
+            say(f"{error.fault}, so nothing is measured against {path}.")
+            return None
         made_for = None if style_image is not None or expected is None else expected.record.painting
         if made_for not in (None, painting.digest):
             say(f"The painting {path} is another picture by now, so nothing is measured against it.")

@@ -82,8 +82,8 @@ def write_checkpoint(
     for name, tensor in pipeline.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise InputError(
-                f"Iteration {step + 1} isn't saved, because {name} isn't finite in it; go on from an earlier "
-                "checkpoint with a lower learning rate, --optimizers.fields.optimizer.lr."
+                f"Iteration {step + 1} isn't saved, because {name} isn't finite in it",
+                "go on from an earlier checkpoint with a lower learning rate, --optimizers.fields.optimizer.lr",
             )
     state = {
         "step": step,

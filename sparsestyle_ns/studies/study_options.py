@@ -25,8 +25,9 @@ class StudyOptions(CommandOptions):
     output_dir: Path = Path("outputs/studies")
     """Folder of the runs; those in it are used again. Keep other runs out of it: hier-style takes the newest coarse
     run below its --output-dir, and that must not be an ablation's."""
-    parser: str = "llff-data"
-    """nerfstudio's name of the scene's dataparser."""
+    parser: Optional[str] = None
+    """nerfstudio's name of the scene's dataparser, where its files don't tell, with its options behind it:
+    --parser='llff-data --eval-interval 4'."""
     max_image_side: Optional[int] = None
     """Longer side, in pixels, that photos are reduced to; None: the methods' own limit."""
     draft: bool = False
