@@ -2,6 +2,7 @@
 
 import functools
 import math
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Dict, Literal, Optional, Tuple, Type, Union
@@ -222,6 +223,10 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         """Rays to points of known depth; None where the effect is off. Found when training begins."""
         rays = None if self.effects is None else matched_rays(self.effects, self.scene)
         return None if rays is None else MatchedRays(**{key: part.to(self.device) for key, part in vars(rays).items()})
+
+    def get_datapath(self) -> Path:
+        """Where a viewer keeps camera paths: as nerfstudio's do, with the scene, else where the command was started."""
+        return self.config.data if os.access(self.config.data, os.W_OK) else Path.cwd()
 
     def setup_train(self) -> None:
         """Nothing yet: rays are generated once it is decided whether lenses bend them (`set_effects`)."""
