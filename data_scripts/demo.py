@@ -61,7 +61,7 @@ def make_stages(options: Options) -> List[Stage]:
     film, page = folder / "stylised.mp4", folder / "index.html"
     scene_flags = ["--layout", options.scene, "--width", "252"]
     make_scene = ["python", str(SCRIPTS / "make_sample_scene.py"), str(folder / "scene"), *scene_flags, "--force"]
-    make_style = ["python", str(SCRIPTS / "make_style_image.py"), str(style)]
+    make_style = ["python", str(SCRIPTS / "make_style_image.py"), str(style), "--force"]
     coarse = train_command(COARSE, [], scene, outputs, options.iterations_coarse)
     stylised = train_command(STYLE, ["--style-image", str(style)], scene, outputs, options.iterations_style)
 
@@ -77,7 +77,7 @@ def make_stages(options: Options) -> List[Stage]:
     def show() -> List[List[str]]:
         run = newest_run(outputs / scene.name, STYLE)
         command = ["sparsestyle", "gallery", str(run), "--output-path", str(page), "--video", str(film)]
-        return [[*command, "--title", "A few photos and a painting"]]
+        return [[*command, "--title", "A few photos and a painting", "--force"]]
 
     rendering = f"{options.frames} frames of {options.film_side} pixels" + ", also as pictures" * options.images
     return [

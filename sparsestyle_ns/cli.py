@@ -4,7 +4,9 @@ A subcommand is a class of options, whose docstrings are its help, and a functio
 """
 
 import importlib
-from typing import Dict, Optional, Sequence, Tuple, Type
+import sys
+from dataclasses import fields
+from typing import Dict, List, Optional, Sequence, Set, Tuple, Type
 
 import tyro
 
@@ -29,6 +31,24 @@ SUBCOMMANDS: Dict[str, Tuple[Type[CommandOptions], str]] = {
 """Each subcommand's options, and the function that takes them."""
 
 
+def with_dashes(arguments: List[str]) -> List[str]:
+    """The command line with the two dashes behind which a dataparser's own options come, where they were left out."""
+    options, _ = SUBCOMMANDS.get(arguments[0] if arguments else "", (CommandOptions, ""))
+    if "--" in arguments or not any(each.name == "dataparser" for each in fields(options)):
+        return arguments
+    for place, (before, word, after) in enumerate(zip(arguments, arguments[1:], arguments[2:], strict=False), start=1):
+        if not before.startswith("-") and after.startswith("--") and word in dataparser_names():
+            return [*arguments[:place], "--", *arguments[place:]]
+    return arguments
+
+
+def dataparser_names() -> Set[str]:
+    """Those that nerfstudio knows."""
+    from nerfstudio.configs.dataparser_configs import all_dataparsers  # takes seconds, and is rarely needed
+
+    return set(all_dataparsers)
+
+
 @exit_on_input_error
 def main(arguments: Optional[Sequence[str]] = None) -> None:
     """The command line; `arguments` default to the process's own."""
@@ -39,8 +59,9 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
             {name: options for name, (options, _) in SUBCOMMANDS.items()},
             prog="sparsestyle",
             description="Tools around stylised scenes. Training, rendering and viewing are nerfstudio's ns-* commands.",
-            args=arguments,
+            args=with_dashes(sys.argv[1:] if arguments is None else list(arguments)),
         )
+        options.expand_paths()
         options.check()
         module, function = dict(SUBCOMMANDS.values())[type(options)].split(":")
         getattr(importlib.import_module(f"sparsestyle_ns.{module}"), function)(options)

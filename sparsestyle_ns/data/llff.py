@@ -138,12 +138,13 @@ def read_poses_bounds(folder: Path) -> LLFFCameras:
         InputError: if the file is missing, is not an array of N rows of 17 numbers, or a row describes no camera.
     """
     if not folder.is_dir():
-        raise InputError(f"There is no folder {folder}: give an LLFF folder with --data.")
+        raise InputError(f"There is no folder {folder}", "give an LLFF folder with --data")
     path = folder / "poses_bounds.npy"
     if not path.exists():
         raise InputError(
             f"{folder} has no poses_bounds.npy: an LLFF folder needs that file (LLFF's imgs2poses.py writes it) "
-            f"and one of images_8, images_4, images{advice(folder, path.name)}."
+            "and one of images_8, images_4, images",
+            advice(folder, path.name),
         )
     rows = _load_rows(path)
     down, right, back, position, size = rows[:, :15].reshape(-1, 3, 5).unbind(-1)
@@ -209,12 +210,12 @@ def _find_images(folder: Path, downscale_factor: Optional[int], num_poses: int) 
     if image_folder is None:
         there = sorted(path.name for path in folder.glob("images*") if path.is_dir())
         advice = f"choose from {', '.join(there)} with --downscale-factor" if there else "put the photos into images"
-        raise InputError(f"{folder} has no folder {' or '.join(names)}: {advice}.")
+        raise InputError(f"{folder} has no folder {' or '.join(names)}", advice)
     filenames = images_in(image_folder, (".jpg", ".jpeg", ".png"))
     if not filenames:
         raise InputError(
-            f"{image_folder} has no .jpg, .jpeg or .png image: put the photos there, "
-            "or choose another folder with --downscale-factor."
+            f"{image_folder} has no .jpg, .jpeg or .png image",
+            "put the photos there, or choose another folder with --downscale-factor",
         )
     if len(filenames) != num_poses:
         raise InputError(

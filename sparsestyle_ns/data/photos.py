@@ -3,17 +3,19 @@
 import copy
 from collections import Counter
 from pathlib import Path
-from typing import Any, Dict, List, Literal, Sequence, Tuple
+from typing import Any, Dict, List, Literal, Optional, Sequence, Tuple
 
 import numpy as np
 import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from torch import Tensor
 
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import digest
 
 IMAGE_MODES = ("L", "RGB", "RGBA")
 """Pillow's names of the pixel formats that are read as they are meant."""
@@ -53,6 +55,19 @@ def open_photo(path: Path, draft: bool = False) -> Image.Image:
         also = f", {broken} of which are not finite" * (broken > 0)
         raise InputError(f"{path} has pixels of the kind {image.mode}{also}: save it as 8-bit RGB or RGBA.")
     return image
+
+
+def photo_digests(outputs: DataparserOutputs) -> List[Optional[str]]:
+    """The `digest` of each view's photo, with its mask where it has one; None where that can't be read."""
+
+    def of_files(*paths: Optional[Path]) -> Optional[str]:
+        try:
+            return digest(*(path.read_bytes() for path in paths if path is not None))
+        except OSError:
+            return None
+
+    masks = outputs.mask_filenames or [None] * len(outputs.image_filenames)
+    return list(map(of_files, outputs.image_filenames, masks))
 
 
 def photo_size(path: Path) -> Tuple[int, int]:
@@ -106,14 +121,14 @@ def _check_content(path: Path, pixels: UInt8[np.ndarray, "H W channels"]) -> Non
     height, width, channels = pixels.shape
     if min(height, width) < SMALLEST_SIDE:
         raise InputError(
-            f"{path} is {width}x{height} pixels, but at least {SMALLEST_SIDE} a side are needed: replace it, or choose "
-            "other views with --view-ids."
+            f"{path} is {width}x{height} pixels, but at least {SMALLEST_SIDE} a side are needed: replace it, or take "
+            "it and its pose out of the scene."
         )
     opaque = channels == 3 or pixels[..., 3].min() == 255
     nothing = pixels[..., :3].max() <= DARKEST if opaque else pixels[..., 3].max() == 0
     if nothing:
         kind = "black" if opaque else "transparent"
-        raise InputError(f"{path} is {kind} all over: replace it, or choose other views with --view-ids.")
+        raise InputError(f"{path} is {kind} all over: replace it, or take it and its pose out of the scene.")
 
 
 class PhotoDataset(InputDataset):

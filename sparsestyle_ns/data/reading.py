@@ -135,8 +135,7 @@ def _read(path: Path) -> Dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         where = f"{path.parent} has no {path.name}" if path.parent.is_dir() else f"There is no folder {path.parent}"
-        what = advice(path.parent, path.name) or "; name the folder of a scene with --data"
-        raise InputError(f"{where}{what}.") from error
+        raise InputError(where, advice(path.parent, path.name) or "name the folder of a scene with --data") from error
     except (OSError, ValueError, RecursionError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
         raise InputError(f"{path} can't be read as JSON ({error}): export the scene again.") from error
     if not isinstance(content, dict):

@@ -13,9 +13,8 @@ from types import FrameType
 from typing import Any, ClassVar, Dict, List, Literal, Optional, Tuple, Type
 
 import torch
-import yaml
 from nerfstudio.configs.base_config import MachineConfig
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import comms, writer
 from nerfstudio.utils.decorators import check_main_thread, check_viewer_enabled
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -24,16 +23,16 @@ from torch import Tensor
 from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.engine.hints import finish, ns_train_style, resume_command
 from sparsestyle_ns.engine.previews import preview_steps, write_preview
+from sparsestyle_ns.engine.run_config import RunConfig
 from sparsestyle_ns.engine.training import check_skipped, training_step
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.runs import checkpoints
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path
 from sparsestyle_ns.runs.run_folder import remove_empty_run
-from sparsestyle_ns.runs.scene_record import record_scene
+from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord, record_scene
 from sparsestyle_ns.utils.distributed import any_process, prepare_launch, share_state
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
-from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.interrupts import StoppedByCtrlC, stop, take_away_at_end
 from sparsestyle_ns.utils.progress import bar, say
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
@@ -54,7 +53,7 @@ def this_machine() -> MachineConfig:
 
 
 @dataclass
-class SparseStyleTrainerConfig(TrainerConfig):
+class SparseStyleTrainerConfig(RunConfig):
     """Settings of a run of either method."""
 
     _target: Type = field(default_factory=lambda: SparseStyleTrainer)
@@ -71,23 +70,26 @@ class SparseStyleTrainerConfig(TrainerConfig):
 
     @exit_on_input_error
     def save_config(self) -> None:
-        """Writes config.yml into the run's folder; `ns-train` calls it right before it starts processes."""
-        machine, folder, gpus = self.machine, self.get_base_dir(), torch.cuda.device_count()
+        """Finds the run its folder, and writes config.yml there; `ns-train` calls it before it starts processes."""
+        machine, gpus = self.machine, torch.cuda.device_count()
         if machine.device_type == "cuda" and machine.num_devices > gpus:
             advice = "ask for fewer." if gpus else "give --machine.device-type cpu."
             raise InputError(
                 f"--machine.device-type is cuda and --machine.num-devices {machine.num_devices}, but torch finds "
                 f"{gpus or 'no'} GPU{'s' * (gpus > 1)} here; {advice}"
             )
+        self.find_place()
         if machine.num_devices * machine.num_machines > 1:
             prepare_launch()
+        folder = self.get_base_dir()
         if not folder.exists():
             take_away_at_end(lambda: remove_empty_run(folder))
-        try:
-            write_whole(folder / "config.yml", yaml.dump(self))
-        except OSError as error:
-            where = f"{folder} ({error.strerror}); name a folder that can be written to with --output-dir."
-            raise InputError(f"The run can't be saved in {where}") from error
+        self.write_config()
+
+
+def run_notes(effects: Decisions, record: Optional[SceneRecord]) -> CheckpointNotes:
+    """What the checkpoint of every run says beside the state, as far as it is known."""
+    return {"effects": effects.records(), **({} if record is None else {"scene": asdict(record)})}
 
 
 class SparseStyleTrainer(Trainer, ABC):
@@ -107,15 +109,38 @@ class SparseStyleTrainer(Trainer, ABC):
         self._preview_steps = preview_steps(self.config.previews, self.config.max_num_iterations)
         self._reported = 0
         self._kept_step: Optional[int] = None
+        self._own_checkpoint: Optional[Path] = None
+        self.record: Optional[SceneRecord] = None
+        if self.resumed is not None:
+            self.config.pipeline.datamanager.expected = self._expected_scene()
         if self.resumed is not None and "effects" in self.resumed:
             decided = Decisions.from_records(self.resumed["effects"])
-            decided.check_choices(self.config.pipeline.effects, f"the checkpoint {self._resumed_checkpoint()}")
+            decided.check_choices(self.config.pipeline.effects, f"the checkpoint {self.config.resumed_checkpoint()}")
             self.config = replace(self.config, pipeline=replace(self.config.pipeline, decided=decided))
         super().setup(test_mode)
+        manager = self.pipeline.datamanager
+        manager.config.expected = None  # it is that scene
         if comms.is_main_process():
-            manager, effects = self.pipeline.datamanager, self.pipeline.effects
-            record_scene(manager.config.data, manager.train_dataparser_outputs, effects).save(self.base_dir)
+            parts = manager.train_dataparser_outputs, self.pipeline.effects, manager.measured_views()
+            self.record = self.completed(record_scene(manager.config.data, *parts))
+            self.record.save(self.base_dir)
             self._save_decisions()
+
+    def completed(self, record: SceneRecord) -> SceneRecord:
+        """The record of the scene with what the method adds to it."""
+        return record
+
+    def _expected_scene(self) -> Optional[ExpectedScene]:
+        """What the scene was when the checkpoint that training goes on from was made; None where nothing says that."""
+        checkpoint = self.config.resumed_checkpoint()
+        if "scene" in self.resumed:
+            record = SceneRecord.from_content(self.resumed["scene"])
+        elif (checkpoint.parents[1] / RECORD_FILE).is_file():  # of an earlier version
+            record = SceneRecord.load(checkpoint.parents[1])
+        else:
+            return None
+        advice = "go on with the photos, views and settings of the dataparser that it was trained with, or begin anew"
+        return ExpectedScene(record, f"The checkpoint {checkpoint}", advice, measured=False)
 
     def setup_optimizers(self) -> FiniteOptimizers:
         """Optimisers that skip steps whose gradient isn't finite."""
@@ -125,28 +150,13 @@ class SparseStyleTrainer(Trainer, ABC):
         self.pipeline.effects.save(self.base_dir)
         self._saved_decisions = self.pipeline.effects
         decided = replace(self.config.pipeline, decided=self.pipeline.effects)
-        replace(self.config, pipeline=decided).save_config()
+        replace(self.config, pipeline=decided).write_config()
 
     @functools.cached_property
     def resumed(self) -> Optional[Dict[str, Any]]:
         """What is in the checkpoint that training goes on from, until it is loaded; None for a new run."""
-        checkpoint = self._resumed_checkpoint()
+        checkpoint = self.config.resumed_checkpoint()
         return None if checkpoint is None else checkpoints.load_checkpoint(checkpoint)
-
-    def _resumed_checkpoint(self) -> Optional[Path]:
-        for source in (self.config.load_dir, self.config.load_checkpoint):
-            if source is not None and not source.exists():
-                raise InputError(
-                    f"There is nothing to resume at {source}; name a folder of checkpoints or one of them."
-                )
-        folder, step = self.config.load_dir, self.config.load_step
-        if folder is None:
-            return self.config.load_checkpoint
-        checkpoint = checkpoints.newest_checkpoint(folder) if step is None else checkpoint_path(folder, step)
-        if checkpoint is None or not checkpoint.is_file():
-            what = "checkpoint" if step is None else f"checkpoint of iteration {step}"
-            raise InputError(f"There is no {what} in {folder}; name a run's nerfstudio_models folder.")
-        return checkpoint
 
     def _load_checkpoint(self) -> None:
         state = self.resumed
@@ -157,7 +167,7 @@ class SparseStyleTrainer(Trainer, ABC):
                 self.optimizers.load_schedulers(state["schedulers"])
             self.grad_scaler.load_state_dict(state["scalers"])
             self._start_step, self._kept_step = state["step"] + 1, state["step"]
-            CONSOLE.print(f"Going on from {self._resumed_checkpoint()}.", soft_wrap=True)
+            CONSOLE.print(f"Going on from {self.config.resumed_checkpoint()}.", soft_wrap=True)
         self.resumed = None
         share_state(self.pipeline.model)
 
@@ -293,13 +303,14 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def notes(self) -> CheckpointNotes:
         """What a checkpoint says beside the state."""
-        return {"effects": self.pipeline.effects.records()}
+        return run_notes(self.pipeline.effects, self.record)
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Saves a checkpoint as nerfstudio does, but only a whole and finite one, and drops the former one after that.
 
-        While steps are being skipped nothing is saved; at the end of training the former checkpoint is kept then.
+        None is dropped that was there when training began or went on. While steps are being skipped nothing is saved;
+        at the end of training the former checkpoint is kept then.
         """
         suspect = self._look_at_skipped(step) > 0
         if suspect and not self._interrupted and step + 1 < self.config.max_num_iterations:
@@ -314,10 +325,9 @@ class SparseStyleTrainer(Trainer, ABC):
                 "one is still there. Make room, and go on from it with --load-dir."
             ) from error
         self._kept_step = step
-        if self.config.save_only_latest_checkpoint and not suspect:
-            for path in self.checkpoint_dir.glob("step-*.ckpt"):
-                if path != target:
-                    path.unlink()
+        if self.config.save_only_latest_checkpoint and not suspect and self._own_checkpoint not in (None, target):
+            self._own_checkpoint.unlink(missing_ok=True)
+        self._own_checkpoint = target
         if self.pipeline.effects != self._saved_decisions:
             self._save_decisions()
 

@@ -12,7 +12,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from sparsestyle_ns.data.photos import PhotoDataset, at_size
 from sparsestyle_ns.data.view_selection import evenly_spaced
 from sparsestyle_ns.engine.hints import finish
-from sparsestyle_ns.engine.loading import load_run
+from sparsestyle_ns.engine.loading import LoadedRun, load_run
 from sparsestyle_ns.evaluation.held_out import HeldOutReport, exact_outputs, means_of, saved_report
 from sparsestyle_ns.evaluation.tables import Table, report_tables, table_of
 from sparsestyle_ns.gallery.film import as_pixels, make_film, read_film
@@ -22,7 +22,7 @@ from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipe
 from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.files import write_output
+from sparsestyle_ns.utils.files import free_path, write_output
 from sparsestyle_ns.utils.page import Pixels
 from sparsestyle_ns.utils.progress import say, track
 
@@ -39,7 +39,7 @@ def make_gallery(options: GalleryOptions) -> None:
         runs.append(collect_run(run, film, options.num_views, options.frames, options.evaluate))
     page = write_output(options.output_path, gallery_page(runs, options.title), "The page", "index.html")
     first = find_config(options.runs[0]).parent
-    finish(page, ["sparsestyle", "export", first, "--format", "html", "--output-path", "scene.html"])
+    finish(page, ["sparsestyle", "export", first, "--format", "html", "--output-path", free_path(Path("scene.html"))])
 
 
 def collect_run(
@@ -57,7 +57,8 @@ def collect_run(
             report of its newest checkpoint. Without a report, the views that are shown are measured.
     """
     config_path = find_config(run, STYLE_METHOD)
-    config, pipeline, step = load_run(config_path)
+    loaded = load_run(config_path)
+    config, pipeline, step = loaded
     dataset = pipeline.datamanager.train_dataset
     originals = PhotoDataset(dataset._dataparser_outputs)  # at their files' size, whatever the run was trained on
     photos = [Picture(_photo(originals, index), path.name) for index, path in enumerate(originals.image_filenames)]
@@ -66,7 +67,7 @@ def collect_run(
         film = make_film(pipeline.model, dataset.cameras, frames, LONGEST_SIDE)
     report = saved_report(config_path.parent, step)
     if report is None and evaluate:
-        report = _evaluate(config_path.parent, config, pipeline, step)
+        report = _evaluate(config_path.parent, loaded)
     painting = config.pipeline.style_image
     return RunPictures(
         name=Path(config.experiment_name).name,
@@ -83,11 +84,11 @@ def collect_run(
     )
 
 
-def _evaluate(folder: Path, config: TrainerConfig, pipeline: HierStylePipeline, step: int) -> HeldOutReport:
+def _evaluate(folder: Path, run: LoadedRun) -> HeldOutReport:
     """Measures a run on all held-out views, and saves the report in its folder, if that can be."""
-    report = pipeline.held_out_report()
+    report = run.pipeline.held_out_report()
     try:
-        report.save(folder / REPORT_FILE, config.experiment_name, config.method_name, step)
+        run.save_report(report, folder / REPORT_FILE)
     except OSError as error:
         say(f"{REPORT_FILE} can't be saved in {folder} ({error.strerror}); its figures are on the page.")
     return report

@@ -71,6 +71,7 @@ class Run:
         """Eight hexadecimal digits of all that decides the outcome but the program itself."""
         study = self.study
         parts = [self.method, self.iterations, *self.settings, *study.flags(self.stage), study.data.resolve()]
+        parts.append(study.photo_digest)
         parts += [study.dataparser, study.max_image_side, study.num_views, study.view_ids]
         if self.painting is not None:
             parts.append(hashlib.sha256(self.painting.read_bytes()).hexdigest())

@@ -7,6 +7,7 @@ from typing import Annotated, List, Literal, Optional, Tuple
 import tyro
 
 from sparsestyle_ns.utils.errors import CommandOptions
+from sparsestyle_ns.utils.files import free_path
 
 Group = Literal["quadrature", "training", "fine-field", "style", "rendering", "precision"]
 
@@ -24,8 +25,9 @@ class StudyOptions(CommandOptions):
     output_dir: Path = Path("outputs/studies")
     """Folder of the runs; those in it are used again. Keep other runs out of it: hier-style takes the newest coarse
     run below its --output-dir, and that must not be an ablation's."""
-    parser: str = "llff-data"
-    """nerfstudio's name of the scene's dataparser."""
+    parser: Optional[str] = None
+    """nerfstudio's name of the scene's dataparser, where its files don't tell, with its options behind it:
+    --parser='llff-data --eval-interval 4'."""
     max_image_side: Optional[int] = None
     """Longer side, in pixels, that photos are reduced to; None: the methods' own limit."""
     draft: bool = False
@@ -40,10 +42,12 @@ class StudyOptions(CommandOptions):
     """The same for all runs of stage 2: --style-flags='--flag value'."""
     jobs: Optional[int] = None
     """Runs at a time; None: one, or one for every four CPU cores where there is no GPU."""
+    force: bool = False
+    """Write over the page, if there is one of that name."""
 
     def ablate_command(self) -> List[object]:
         """The command that runs the ablations on the same runs."""
-        other = replace(self, output_path=self.output_path.with_name("ablate.html"))
+        other = replace(self, output_path=free_path(self.output_path.with_name("ablate.html")), force=False)
         command: List[object] = ["sparsestyle", "ablate", "--data", other.data, "--style-images", *other.style_images]
         command += ["--output-path", other.output_path]
         for each in fields(other)[3:]:
@@ -91,8 +95,8 @@ class TradeoffOptions(CommandOptions):
     """The painting; without it, what stylises is left out."""
     budget: str = "10m"
     """Time that it may take, such as 90s, 10m or 1h30m. More of it gives longer runs and more repetitions."""
-    output_dir: Path = Path("tradeoff")
-    """Folder of the report."""
+    output_dir: Optional[Path] = None
+    """Folder of the report; left out, tradeoff here, or "tradeoff 2" where that is there already."""
     coarse_run: Optional[Path] = None
     """Folder of a coarse-fewshot run of this scene to render; left out, one is trained in a part of the time."""
     max_image_side: Optional[int] = None
@@ -111,3 +115,5 @@ class TradeoffOptions(CommandOptions):
     """File with the weights of VGG-16, as for ns-train."""
     backbone: Literal["auto", "vgg16", "vgg16-shift-tolerant"] = "auto"
     """Feature network, as for ns-train."""
+    force: bool = False
+    """Write over the report in the folder that --output-dir names, if there is one."""

@@ -3,6 +3,7 @@
 import gc
 import tempfile
 import warnings
+from dataclasses import replace
 from datetime import datetime, timezone
 from typing import Dict, List, Tuple
 
@@ -18,7 +19,7 @@ from sparsestyle_ns.studies.measure_training import StageRuns
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.studies.study_options import TradeoffOptions
 from sparsestyle_ns.studies.time_budget import Budget, Plan, parse_duration, run_plans
-from sparsestyle_ns.studies.tradeoff_report import GROUPS, Fact, Report, writing_to
+from sparsestyle_ns.studies.tradeoff_report import GROUPS, Fact, Report, report_folder, writing_to
 from sparsestyle_ns.studies.workbench import Workbench
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.interrupts import PRESSES, StoppedByCtrlC, stop
@@ -35,7 +36,7 @@ def tradeoff(options: TradeoffOptions) -> None:
     budget_seconds = parse_duration(options.budget)
     if options.rounds < 1:
         raise InputError(f"--rounds is {options.rounds}, but has to be at least 1.")
-    study = study_of(options)
+    study, options = study_of(options), replace(options, output_dir=report_folder(options.output_dir, options.force))
     try:
         report = measure(study, options, Budget(budget_seconds))
     except PRESSES:

@@ -13,6 +13,7 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from torch import Tensor
 
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import digest
 
 SMALLEST_SIDE, THUMBNAIL_SIDE = 8, 200
 """Pixels: what each side of a painting must have, and the longer side of its thumbnail."""
@@ -29,6 +30,11 @@ class Painting:
     data: bytes
     pixels: Float[Tensor, "3 H W"]
     """RGB in [0, 1], float32, on the CPU, upright as its EXIF orientation says."""
+
+    @property
+    def digest(self) -> str:
+        """By which the file is known again."""
+        return digest(self.data)
 
     @classmethod
     def read(cls, path: Union[str, Path]) -> "Painting":
