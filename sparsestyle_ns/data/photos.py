@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any, Dict, List, Literal, Optional, Sequence, Tuple
 
 import numpy as np
+import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import digest
+from sparsestyle_ns.utils.pictures import read_mask
 
 IMAGE_MODES = ("L", "RGB", "RGBA")
 """Pillow's names of the pixel formats that are read as they are meant."""
@@ -152,15 +154,30 @@ class PhotoDataset(InputDataset):
         return np.array(image if image.size == size else image.resize(size, resample=Image.Resampling.BILINEAR))
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> Dict[str, Any]:
-        """nerfstudio's dictionary of a photo and, where there is one, its mask."""
+        """nerfstudio's dictionary of a photo and, where there is one, its mask, which nerfstudio would misread."""
+        image = self.get_image_uint8(image_idx) if image_type == "uint8" else self.get_image_float32(image_idx)
+        data: Dict[str, Any] = {"image_idx": image_idx, "image": image}
+        masks = self._dataparser_outputs.mask_filenames
+        if masks is not None:
+            data["mask"] = torch.from_numpy(self._read_mask(masks[image_idx], image_idx))[..., None]
+            if self.mask_color:
+                data["image"] = torch.where(data["mask"], image, image.new_tensor(self.mask_color))
+        return data
+
+    def _read_mask(self, mask: Path, image_idx: int) -> Bool[np.ndarray, "H W"]:
+        """Which pixels of a photo, at the size of its camera, a mask leaves in."""
+        photo = self.image_filenames[image_idx]
         try:
-            return super().get_data(image_idx, image_type)
-        except InputError:
-            raise
-        except Exception as error:  # nerfstudio's reader of masks names neither the file nor what is wrong
-            if self._dataparser_outputs.mask_filenames is None:
-                raise
-            mask = self._dataparser_outputs.mask_filenames[image_idx]
+            inside = read_mask(mask.read_bytes())
+        except Exception as error:  # decoders meet a damaged file with errors of many kinds
+            raise InputError(f"The mask {mask} doesn't fit {photo}, as it can't be read: replace it.") from error
+        width, height = photo_size(photo)
+        if inside.shape != (height, width):
             raise InputError(
-                f"The mask {mask} doesn't fit {self.image_filenames[image_idx]} or can't be read: replace it."
-            ) from error
+                f"The mask {mask} doesn't fit {photo}: it is {inside.shape[1]}x{inside.shape[0]} pixels, and the photo "
+                f"{width}x{height}; scale it to that size."
+            )
+        if not inside.any():
+            raise InputError(f"The mask {mask} leaves nothing of {photo} in: replace it, or take out both.")
+        size = int(self.cameras.width[image_idx]), int(self.cameras.height[image_idx])
+        return np.array(Image.fromarray(inside).resize(size, resample=Image.Resampling.NEAREST))
