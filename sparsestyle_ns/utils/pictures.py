@@ -99,4 +99,3 @@ def read_mask(data: bytes) -> Bool[np.ndarray, "H W"]:
 def as_upright(image: Image.Image, orientation: int) -> Image.Image:
     """A picture without EXIF, turned by an orientation that it had."""
     return image if orientation == 1 else image.transpose(TURNS[orientation])
-
