@@ -114,7 +114,7 @@ class LLFFDataParser(DataParser):
             raise InputError(f"--eval-interval {interval} would leave no image to train on: give 2 or more.")
         if not 0 < scale < math.inf:
             raise InputError(f"--bound-scale {scale} is no scale: give a number above 0, such as 0.75.")
-        if factor is not None and factor < 1:
+        if factor is not None and (factor < 1 or factor != int(factor)):  # ns-render has it as 2.0
             raise InputError(f"--downscale-factor {factor} names no folder: give N for images_N, 1 for images.")
 
     def _view_ids(self, split: str, num_views: int) -> List[int]:
@@ -205,7 +205,7 @@ def _find_images(folder: Path, downscale_factor: Optional[int], num_poses: int) 
     """Sorted image files of the folder that `downscale_factor` names, one for each pose."""
     names = ["images_8", "images_4", "images"]
     if downscale_factor is not None:
-        names = ["images" if downscale_factor == 1 else f"images_{downscale_factor}"]
+        names = ["images" if downscale_factor == 1 else f"images_{int(downscale_factor)}"]
     image_folder = next((folder / name for name in names if (folder / name).is_dir()), None)
     if image_folder is None:
         there = sorted(path.name for path in folder.glob("images*") if path.is_dir())

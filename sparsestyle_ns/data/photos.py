@@ -81,6 +81,20 @@ def photo_size(path: Path) -> Tuple[int, int]:
         return open_photo(path).size  # says what is wrong with it
 
 
+def has_opacity(path: Path) -> bool:
+    """Whether a photo's pixels have an opacity, by its header alone; False where there is none."""
+    try:
+        with Image.open(path) as image:
+            return image.mode == "RGBA"
+    except Exception:
+        return False
+
+
+def is_transparent(path: Path) -> bool:
+    """Whether any pixel of a photo isn't opaque."""
+    return has_opacity(path) and open_photo(path).getchannel("A").getextrema()[0] < 255
+
+
 def check_one_size(filenames: Sequence[Path]) -> None:
     """Raises an `InputError` that names the first photo that isn't of the size that most are of."""
     sizes = {filename: photo_size(filename) for filename in filenames}

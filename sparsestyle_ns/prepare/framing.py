@@ -69,6 +69,9 @@ def find_photos(folder: Path) -> List[Path]:
             f"{folder} has {count} ({', '.join(SUFFIXES)}); a scene needs at least {MIN_PHOTOS}, each taken from "
             "another place."
         )
+    others = sorted(set(images_in(place, tuple(Image.registered_extensions()))) - set(photos))
+    if others:
+        print(f"Passed over, as they are none of {', '.join(SUFFIXES)}: {', '.join(path.name for path in others)}")
     return photos
 
 
