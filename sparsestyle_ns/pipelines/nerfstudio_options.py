@@ -1,6 +1,6 @@
-"""nerfstudio's options and what a scene may hold, as far as these methods have no use for them: each is named in a line.
+"""nerfstudio's options, and what a scene may hold: what has no effect in these methods is named, in a line each.
 
-Every option of the classes below is in a table, so that one that a new nerfstudio adds is missed by a test.
+A test demands each of their options in a table, so that one which a new nerfstudio adds is found.
 """
 
 from dataclasses import MISSING, fields

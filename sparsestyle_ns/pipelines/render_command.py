@@ -7,16 +7,14 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Optional
+from typing import Any, Optional
 
 import numpy as np
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
 from sparsestyle_ns.pipelines.nerfstudio_options import render_options
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress import say
-
-if TYPE_CHECKING:
-    from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 
 AROUND = ("equirectangular", "omnidirectional", "vr180")
 """Kinds of cameras, by their names in a camera path, that see what is behind them."""
@@ -37,7 +35,7 @@ def running_command() -> Optional[Any]:
     return None
 
 
-def prepare_render(pipeline: "CheckedPipeline") -> None:
+def prepare_render(pipeline: VanillaPipeline) -> None:
     """Checks what ns-render was asked for, if it is what runs, before a checkpoint is loaded; an InputError refuses."""
     command = running_command()
     if command is None:
@@ -52,7 +50,7 @@ def prepare_render(pipeline: "CheckedPipeline") -> None:
         find_ends(pipeline, command)
 
 
-def find_ends(pipeline: "CheckedPipeline", command: Any) -> None:
+def find_ends(pipeline: VanillaPipeline, command: Any) -> None:
     """Sees to it that `ns-render interpolate` has two cameras to fly between; it flies between held-out views."""
     manager = pipeline.datamanager
     if command.interpolation_steps < 1 or command.frame_rate < 1:
