@@ -159,7 +159,7 @@ def test_a_run_on_a_relative_path_is_measured_on_its_own_scene_from_everywhere(
     other = shutil.copytree(project.scene, tmp_path / "other" / "data" / "llff")
     replace_scene(other)
     monkeypatch.chdir(project.root)
-    ns_train("coarse-fewshot", Path("data/llff"), Path("outputs/new"), "--max-num-iterations", "1", *TINY)
+    ns_train("coarse-fewshot", Path("data/llff"), project.root / "outputs" / "new", "--max-num-iterations", "1", *TINY)
     run = only_run(project.root / "outputs" / "new", "coarse-fewshot")
     as_before = shutil.copytree(run, run.with_name("earlier"))
     config = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader)
@@ -180,7 +180,7 @@ def test_every_tool_reads_the_run_that_was_named_after_a_project_has_moved(
     moved = shutil.copytree(project.root, tmp_path / "deeper" / "down" / "moved")
     checkpoint = newest_checkpoint(project.coarse / "nerfstudio_models")
     state = torch.load(checkpoint, weights_only=True)
-    state["pipeline"]["_model.field.color_head.bias"].fill_(9.0)
+    state["pipeline"]["_model.field.density_head.bias"].fill_(9.0)
     torch.save(state, checkpoint)
     replace_scene(project.scene)
     monkeypatch.chdir(tmp_path)
@@ -302,7 +302,7 @@ def test_a_report_of_other_weights_isnt_shown_as_the_runs_own(project: SimpleNam
     assert saved_report(project.coarse, 2) is not None
     checkpoint = newest_checkpoint(project.coarse / "nerfstudio_models")
     state = torch.load(checkpoint, weights_only=True)
-    state["pipeline"]["_model.field.color_head.bias"].fill_(9.0)
+    state["pipeline"]["_model.field.density_head.bias"].fill_(9.0)
     torch.save(state, checkpoint)
     assert saved_report(project.coarse, 2) is None
 
