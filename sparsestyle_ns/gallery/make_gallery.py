@@ -20,6 +20,7 @@ from sparsestyle_ns.gallery.gallery_options import GalleryOptions
 from sparsestyle_ns.gallery.layout import Film, Picture, RunPictures, View, gallery_page, thumbnail
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig
 from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config
+from sparsestyle_ns.runs.scene_record import ExpectedScene
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import free_path, write_output
@@ -75,7 +76,7 @@ def collect_run(
         photos=photos,
         views=views,
         style_name="" if painting is None else painting.stem,
-        style=_style_picture(painting),
+        style=_style_picture(painting, pipeline.datamanager.config.expected),
         style_note=f"The style image, {painting}, is no longer there.",
         film=film,
         tables=[_views_table(measured)] if report is None else report_tables(report.means, len(report.views)),
@@ -137,15 +138,17 @@ def _photo(dataset: PhotoDataset, index: int) -> Pixels:
     return thumbnail(dataset.get_image_uint8(index)[..., :3].numpy(), LONGEST_SIDE)
 
 
-def _style_picture(path: Optional[Path]) -> Optional[Picture]:
-    """The painting, where its file is still there."""
+def _style_picture(path: Optional[Path], expected: Optional[ExpectedScene]) -> Optional[Picture]:
+    """The painting, where its file is still there; its caption says where that is another picture by now."""
     if path is None:
         return None
     try:
-        pixels = Painting.read(path).pixels
+        painting = Painting.read(path)
     except InputError:
         return None
-    return Picture(thumbnail(as_pixels(pixels.permute(1, 2, 0).numpy()), LONGEST_SIDE), path.name)
+    is_other = expected is not None and expected.record.painting not in (None, painting.digest)
+    pixels = thumbnail(as_pixels(painting.pixels.permute(1, 2, 0).numpy()), LONGEST_SIDE)
+    return Picture(pixels, path.name + ", which is another picture by now" * is_other)
 
 
 def _views_table(views: Sequence[Dict[str, float]]) -> Table:
