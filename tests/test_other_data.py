@@ -14,14 +14,17 @@ import yaml
 from conftest import TINY, TINY_STYLE, ns_train, only_run, run_entrypoint
 from hypothesis import given
 from hypothesis import strategies as st
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
+from test_commands import write_ring, write_transforms
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.evaluation.held_out import saved_report
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.runs.checkpoints import newest_checkpoint
-from sparsestyle_ns.runs.scene_record import RECORD_FILE, SceneRecord
+from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord, record_scene
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.utils.errors import InputError
 
@@ -280,7 +283,6 @@ def test_nothing_is_measured_against_a_painting_that_has_changed(
 
 
 def test_a_coarse_run_of_photos_that_have_changed_isnt_stylised(project: SimpleNamespace) -> None:
-    from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
     from sparsestyle_ns.runs.coarse_run import find_coarse_run
 
     change_photo(project.scene)
@@ -351,3 +353,62 @@ def test_a_scene_is_found_where_it_is_or_refused_never_another(
     else:
         assert os.path.samefile(loaded.find_data(folder), scene)
         assert (loaded.find_data(folder) / "mark").exists()
+
+
+@pytest.fixture(scope="module")
+def ring(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six photos from all around with their transforms.json."""
+    folder = tmp_path_factory.mktemp("ring") / "scene"
+    write_transforms(folder, write_ring(folder))
+    return folder
+
+
+def reorder(content: Dict, place: int, amount: float) -> None:
+    """nerfstudio sorts frames by the names of their photos."""
+    content["frames"] = content["frames"][place:] + content["frames"][:place]
+
+
+def drop(content: Dict, place: int, amount: float) -> None:
+    del content["frames"][place]
+
+
+def move(content: Dict, place: int, amount: float) -> None:
+    content["frames"][place]["transform_matrix"][0][3] += amount
+
+
+def exchange(content: Dict, place: int, amount: float) -> None:
+    one, other = content["frames"][place], content["frames"][(place + 1) % 6]
+    one["file_path"], other["file_path"] = other["file_path"], one["file_path"]
+
+
+def hold_out(content: Dict, place: int, amount: float) -> None:
+    names = [frame["file_path"] for frame in content["frames"]]
+    content["train_filenames"] = names[:place] + names[place + 1 :]
+    content["val_filenames"] = content["test_filenames"] = [names[place]]
+
+
+def leave(content: Dict, place: int, amount: float) -> None:
+    """No change."""
+
+
+@given(
+    change=st.sampled_from([leave, reorder, drop, move, exchange, hold_out]),
+    place=st.integers(0, 5),
+    amount=st.floats(0.05, 1.0),
+)
+def test_a_transforms_file_that_says_something_else_is_refused(
+    ring: Path, tmp_path_factory: pytest.TempPathFactory, change: Callable, place: int, amount: float
+) -> None:
+    scene = shutil.copytree(ring, tmp_path_factory.mktemp("changed") / "scene")
+    config = FewShotDataManagerConfig(data=scene, dataparser=NerfstudioDataParserConfig(), max_image_side=None)
+    manager = config.setup(device="cpu", test_mode="test")
+    outputs = manager.train_dataparser_outputs, None, manager.measured_views()
+    config.expected = ExpectedScene(record_scene(scene, *outputs), "The run", "see to it")
+    content = json.loads((scene / "transforms.json").read_text())
+    change(content, place, amount)
+    (scene / "transforms.json").write_text(json.dumps(content))
+    if change in (leave, reorder):
+        config.setup(device="cpu", test_mode="test")
+    else:
+        with pytest.raises(InputError, match=r"The run doesn't fit .* as it is now \(.*\); see to it"):
+            config.setup(device="cpu", test_mode="test")
