@@ -1,5 +1,6 @@
 """What a command saved stays: another one takes a new name, or is told that what is there may be lost."""
 
+import copy
 import json
 import re
 import shlex
@@ -108,7 +109,7 @@ def test_runs_that_begin_in_one_second_have_folders_of_their_own(tmp_path: Path)
 
     names = []
     for _ in range(2):
-        config = method_config("coarse-fewshot")
+        config = copy.deepcopy(method_config("coarse-fewshot"))
         config.output_dir, config.data, config.timestamp = tmp_path, Path("fern"), "{timestamp}"
         config.set_timestamp()
         config.get_base_dir().mkdir(parents=True)

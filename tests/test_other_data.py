@@ -20,6 +20,7 @@ from test_commands import write_ring, write_transforms
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
+from sparsestyle_ns.engine.hints import after_evaluation
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.evaluation.held_out import saved_report
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
@@ -195,6 +196,8 @@ def test_every_tool_reads_the_run_that_was_named_after_a_project_has_moved(
     ours, theirs = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("ours", "theirs"))
     assert theirs["checkpoint"] == str(run / "nerfstudio_models" / checkpoint.name)
     assert ours["results"].items() <= theirs["results"].items()
+    command = after_evaluation(run, stylised=False)
+    assert command[command.index("--data") + 1] == str(moved / "data" / "llff") and "--output-dir" not in command
     _, pipeline, _ = load_run(moved / project.style.relative_to(project.root) / "config.yml")
     assert pipeline.config.style_image == moved / "painting.png"
 

@@ -1,6 +1,7 @@
 """nerfstudio's trainer, made to keep what it has: whole checkpoints, also on Ctrl-C, and resuming where it stopped."""
 
 import functools
+import os
 import signal
 import warnings
 from abc import ABC, abstractmethod
@@ -107,6 +108,8 @@ class SparseStyleTrainer(Trainer, ABC):
             decided = Decisions.from_records(self.resumed["effects"])
             decided.check_choices(self.config.pipeline.effects, f"the checkpoint {self.config.resumed_checkpoint()}")
             self.config = replace(self.config, pipeline=replace(self.config.pipeline, decided=decided))
+        if self.config.data is not None and not os.access(self.config.data, os.W_OK):
+            self.config = replace(self.config, data=None)  # where nerfstudio's viewer would make a folder
         super().setup(test_mode)
         manager = self.pipeline.datamanager
         manager.config.expected = None  # it is that scene
