@@ -46,8 +46,9 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     """Shares of the iterations at these sizes."""
     feature_side: Optional[int] = None
     """Longer side, in pixels, at which the feature network sees rendered views of the photos' size. None: theirs."""
-    style_side: Optional[int] = None
-    """Longer side at which it sees the style image then: smaller gives finer strokes. None: as the views."""
+    stroke_size: Annotated[float, tyro.conf.arg(aliases=("--stroke-size",))] = 1.0
+    """How large the painting's strokes are in the views, from 0.5 to 2: 1 is as large as if both had the same longer
+    side."""
     style_features: Optional[int] = None
     """Match with at most so many of the painting's feature vectors, drawn at random; None: all of them."""
     loss_weights: Dict[str, float] = field(default_factory=default_weights)
@@ -76,6 +77,8 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         """The painting and the feature network, on the CPU; InputError where these or a setting can't be used."""
         if self.style_features is not None and self.style_features < 1:
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
+        if not 0.5 <= self.stroke_size <= 2.0:
+            raise InputError(f"--stroke-size is {self.stroke_size:g}; give a number from 0.5 to 2.")
         for name, weight in self.loss_weights.items():
             if name not in LOSSES:
                 known = ", ".join(LOSSES)
@@ -102,7 +105,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         The network moves to the device.
         """
         side = self.feature_side or photo_side
-        sides = (max(1, round(scale * each)) for each in (side, self.style_side or side))
+        sides = (max(1, round(scale * each)) for each in (side, self.stroke_size * side))
         losses = [name for name, weight in self.loss_weights.items() if weight > 0]
         return StyleTargets(backbone.to(device), painting.pixels.to(device), *sides, self.style_features, losses)
 
