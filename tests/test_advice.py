@@ -420,6 +420,11 @@ TABLE = [
     ),
     Advice("name a folder that can be written to with --output-dir", no_room, coarse("--output-dir elsewhere")),
     Advice("already; name a new one with --timestamp", lambda place: twice("first", place), coarse("--timestamp b")),
+    Advice(
+        "give shares from 0 to 1 with --optimizers.GROUP.scheduler",
+        coarse("--optimizers.fields.scheduler.final 2"),
+        coarse("--optimizers.fields.scheduler.final 0.5"),
+    ),
     Advice("try a lower learning rate, --optimizers.", skip_all, coarse("--optimizers.fields.optimizer.lr 1e-4")),
     Advice("go on from it with --load-dir", full_disk, lambda place: goes_on("--max-num-iterations 4", place)),
     Advice(

@@ -1,5 +1,6 @@
 """What a command saved stays: another one takes a new name, or is told that what is there may be lost."""
 
+import contextlib
 import copy
 import json
 import re
@@ -89,7 +90,7 @@ def test_the_config_of_a_finished_run_begins_another_one(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     before = files_below(run)
-    with monkeypatch.context() as patch:
+    with monkeypatch.context() as patch, contextlib.suppress(SystemExit):
         press_ctrl_c_at(patch, step=1)
         load_config(run)
     assert files_below(run) == before
