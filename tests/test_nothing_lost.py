@@ -121,12 +121,12 @@ def test_runs_that_begin_in_one_second_have_folders_of_their_own(tmp_path: Path)
 def test_a_report_of_something_else_is_kept_under_another_name(run: Path, capsys: pytest.CaptureFixture) -> None:
     (run / "evaluation.json").write_text("mine")
     main(["evaluate", str(run)])
-    assert (run / "evaluation 2.json").read_text() == "mine"
-    assert f"kept as {run / 'evaluation 2.json'}" in " ".join(capsys.readouterr().out.split())
+    assert (run / "evaluation-2.json").read_text() == "mine"
+    assert f"kept as {run / 'evaluation-2.json'}" in " ".join(capsys.readouterr().out.split())
     report = (run / "evaluation.json").read_text()
     main(["evaluate", str(run)])  # says the same again, so nothing is lost
     assert (run / "evaluation.json").read_text() == report
-    assert not (run / "evaluation 3.json").exists()
+    assert not (run / "evaluation-3.json").exists()
 
 
 def outputs_of(runs: SimpleNamespace, target: Path) -> Dict[str, List[str]]:
@@ -152,7 +152,7 @@ def test_a_file_that_is_there_is_written_over_only_where_that_is_asked_for(
     if what in ("compare", "ablate"):
         arguments += ["--data", str(llff_scene), "--style-images", str(painting)]
     message = refused(arguments)
-    other = tmp_path / "made 2.html"
+    other = tmp_path / "made-2.html"
     assert message.endswith(f"is there already; name another file, such as {other}, or write over it with --force.")
     assert target.read_text() == "mine"
     if what in ("report", "gallery", "points"):  # the others take longer and write by the same function
@@ -169,8 +169,8 @@ def test_a_gallery_without_a_name_gets_one_of_its_own(
     for name in ("gallery.html", "scene.html"):
         Path(name).write_text("mine")
     main(["gallery", str(runs.style), "--num-views", "1", "--frames", "0"])
-    assert Path("gallery.html").read_text() == "mine" and Path("gallery 2.html").is_file()
-    assert capsys.readouterr().out.splitlines()[-1].endswith("--output-path 'scene 2.html'")
+    assert Path("gallery.html").read_text() == "mine" and Path("gallery-2.html").is_file()
+    assert capsys.readouterr().out.splitlines()[-1].endswith("--output-path scene-2.html")
 
 
 def test_a_tradeoff_report_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,8 +178,8 @@ def test_a_tradeoff_report_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert report_folder(None, force=False) == Path("tradeoff")
     (tmp_path / "tradeoff").mkdir()
     (tmp_path / "tradeoff" / "tradeoff.csv").touch()
-    assert report_folder(None, force=False) == Path("tradeoff 2")
-    with pytest.raises(InputError, match=r"tradeoff already .*such as tradeoff 2, or write over it with --force"):
+    assert report_folder(None, force=False) == Path("tradeoff-2")
+    with pytest.raises(InputError, match=r"tradeoff already .*such as tradeoff-2, or write over it with --force"):
         report_folder(Path("tradeoff"), force=False)
     assert report_folder(Path("tradeoff"), force=True) == Path("tradeoff")
     (tmp_path / "mine").mkdir()
@@ -191,16 +191,16 @@ def test_the_page_after_a_comparison_has_a_name_of_its_own(tmp_path: Path) -> No
     (tmp_path / "ablate.html").touch()
     options = CompareOptions(tmp_path, (Path("a.png"),), tmp_path / "compare.html", force=True)
     command = list(map(str, options.ablate_command()))
-    assert command[command.index("--output-path") + 1] == str(tmp_path / "ablate 2.html")
+    assert command[command.index("--output-path") + 1] == str(tmp_path / "ablate-2.html")
     assert not any("force" in part for part in command)
 
 
 def test_free_names_keep_suffixes_and_count_on(tmp_path: Path) -> None:
     assert free_path(tmp_path / "a.tar.gz") == tmp_path / "a.tar.gz"
-    for name in ("a.html", "a 2.html", "folder"):
+    for name in ("a.html", "a-2.html", "folder"):
         (tmp_path / name).touch()
-    assert free_path(tmp_path / "a.html") == tmp_path / "a 3.html"
-    assert free_path(tmp_path / "folder") == tmp_path / "folder 2"
+    assert free_path(tmp_path / "a.html") == tmp_path / "a-3.html"
+    assert free_path(tmp_path / "folder") == tmp_path / "folder-2"
 
 
 def test_a_painting_is_painted_over_only_where_that_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -99,7 +99,7 @@ class TradeoffOptions(CommandOptions):
     budget: str = "10m"
     """Time that it may take, such as 90s, 10m or 1h30m. More of it gives longer runs and more repetitions."""
     output_dir: Optional[Path] = None
-    """Folder of the report; left out, tradeoff here, or "tradeoff 2" where that is there already."""
+    """Folder of the report; left out, tradeoff here, or tradeoff-2 where that is there already."""
     coarse_run: Optional[Path] = None
     """Folder of a coarse-fewshot run of this scene to render; left out, one is trained in a part of the time."""
     max_image_side: Optional[int] = None

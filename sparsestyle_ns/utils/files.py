@@ -52,8 +52,10 @@ def digest(*contents: bytes) -> str:
 
 def free_path(path: Path) -> Path:
     """A path at which nothing is yet: this, else with a number behind the name."""
-    taken = {each.stem if path.suffix else each.name for each in path.parent.glob("*")} if path.exists() else ()
-    return path.with_name(free_name(path.stem if path.suffix else path.name, taken) + path.suffix)
+    found, number = path, 2
+    while found.exists():
+        found, number = path.with_name(f"{path.stem}-{number}{path.suffix}"), number + 1
+    return found
 
 
 def keep_former(path: Path, content: str) -> Optional[Path]:
