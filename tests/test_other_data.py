@@ -22,12 +22,20 @@ from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.engine.hints import after_evaluation
 from sparsestyle_ns.engine.loading import load_run
+from sparsestyle_ns.evaluation import held_out
 from sparsestyle_ns.evaluation.held_out import saved_report
+from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord, record_scene
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.utils.errors import InputError
+
+
+@pytest.fixture(autouse=True)
+def plain_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports have PSNR alone: to load the networks of other figures takes longer than the rest of these tests."""
+    monkeypatch.setattr(held_out, "image_metrics", lambda render, photo: {"psnr": psnr(render, photo)})
 
 
 @pytest.fixture
@@ -107,7 +115,9 @@ change_by_name = pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES
 
 
 def files_below(folder: Path) -> Dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    """Their contents, but for what a training in this process may still write for tensorboard."""
+    files = (path for path in folder.rglob("*") if path.is_file() and "tfevents" not in path.name)
+    return {path: path.read_bytes() for path in files}
 
 
 def refused(arguments: List[str]) -> str:
