@@ -20,10 +20,7 @@ from conftest import TINY, TINY_STYLE, coarse_pipeline
 from test_docs import ROOT, all_flags, nerfstudio_flags, subcommands
 
 from sparsestyle_ns.cli import main
-from sparsestyle_ns.engine import style_trainer
-from sparsestyle_ns.evaluation import held_out
 from sparsestyle_ns.method_configs import method_config
-from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
 from sparsestyle_ns.utils.errors import InputError
 
 FLAG = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
@@ -93,6 +90,7 @@ def place(
     """Paths that commands name, in a folder where nothing is yet; long work is cut short."""
     from nerfstudio.engine.trainer import Trainer
 
+    from sparsestyle_ns.evaluation import held_out
     from sparsestyle_ns.studies import paper_studies, tradeoff
     from sparsestyle_ns.studies.tradeoff_report import Report
 
@@ -618,6 +616,9 @@ def test_what_a_sentence_says_to_do_can_be_done(
             follow(advice.wrong, place)
         for part in advice.parts:
             assert part in str(ended.value)
+    from sparsestyle_ns.engine import style_trainer
+    from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
+
     # Preparing views takes seconds, and is behind all that can be wrong.
     monkeypatch.setattr(HierStylePipeline, "get_training_callbacks", lambda pipeline, attributes: [])
     monkeypatch.setattr(style_trainer, "warm_start", lambda *arguments: iter(()))
