@@ -145,25 +145,21 @@ def outputs_of(runs: SimpleNamespace, target: Path) -> Dict[str, List[str]]:
         "gallery": ["gallery", str(runs.style), "--output-path", str(target), *few],
         "points": ["export", str(runs.style), "--format", "ply", "--output-path", str(target)],
         "page": ["export", str(runs.style), "--output-path", str(target)],
-        "compare": ["compare", "--output-path", str(target)],
-        "ablate": ["ablate", "--output-path", str(target)],
     }
 
 
-@pytest.mark.parametrize("what", ["report", "gallery", "points", "page", "compare", "ablate"])
+@pytest.mark.parametrize("what", ["report", "gallery", "points", "page"])
 def test_a_file_that_is_there_is_written_over_only_where_that_is_asked_for(
-    runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path, what: str
+    runs: SimpleNamespace, tmp_path: Path, what: str
 ) -> None:
     target = tmp_path / "made.html"
     target.write_text("mine")
     arguments = outputs_of(runs, target)[what]
-    if what in ("compare", "ablate"):
-        arguments += ["--data", str(llff_scene), "--style-images", str(painting)]
     message = refused(arguments)
     other = tmp_path / "made-2.html"
     assert message.endswith(f"is there already; name another file, such as {other}, or write over it with --force.")
     assert target.read_text() == "mine"
-    if what in ("report", "gallery", "points"):  # the others take longer and write by the same function
+    if what != "page":  # which takes longer, and is written by the same function
         main([str(other) if part == str(target) else part for part in arguments])
         assert other.exists() and target.read_text() == "mine"
         main([*arguments, "--force"])
@@ -195,12 +191,16 @@ def test_a_tradeoff_report_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert report_folder(Path("mine"), force=False) == Path("mine")  # a folder may have other files
 
 
-def test_the_page_after_a_comparison_has_a_name_of_its_own(tmp_path: Path) -> None:
-    (tmp_path / "ablate.html").touch()
-    options = CompareOptions(tmp_path, (Path("a.png"),), tmp_path / "compare.html", force=True)
-    command = list(map(str, options.ablate_command()))
-    assert command[command.index("--output-path") + 1] == str(tmp_path / "ablate-2.html")
-    assert not any("force" in part for part in command)
+def test_a_studys_page_that_said_something_else_is_kept(tmp_path: Path) -> None:
+    from sparsestyle_ns.studies.paper_studies import _write_page
+
+    options = CompareOptions(tmp_path, (Path("a.png"),), tmp_path / "compare.html")
+    options.output_path.write_text("mine")
+    runs = SimpleNamespace(study=SimpleNamespace(name="fern"))
+    for _ in range(2):  # the second page is the first
+        assert _write_page("Comparison", options, runs, []) == options.output_path.resolve()
+    assert {path.name for path in tmp_path.iterdir()} == {"compare.html", "compare-2.html"}
+    assert (tmp_path / "compare-2.html").read_text() == "mine"
 
 
 def test_free_names_keep_suffixes_and_count_on(tmp_path: Path) -> None:

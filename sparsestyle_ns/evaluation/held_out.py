@@ -31,7 +31,7 @@ from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.runs.checkpoints import CHECKPOINT_FOLDER, checkpoint_path
 from sparsestyle_ns.runs.run_folder import REPORT_FILE
 from sparsestyle_ns.utils.files import digest, keep_former, write_whole
-from sparsestyle_ns.utils.progress import say, track
+from sparsestyle_ns.utils.progress import track
 
 EVEN_SAMPLES = 64
 """Even samples a ray on which `effective_samples` are counted: the number means something only with this one."""
@@ -66,9 +66,8 @@ class HeldOutReport:
         if checkpoint is not None:
             run["checkpoint"] = digest(checkpoint.read_bytes())
         content = json.dumps({**run, "results": self.means, "views": self.views}, indent=2) + "\n"
-        former = keep_former(path, content) if path.name == REPORT_FILE else None
-        if former is not None:
-            say(f"The report from before is kept as {former}.")
+        if path.name == REPORT_FILE:
+            keep_former(path, content)
         write_whole(path, content)
 
 

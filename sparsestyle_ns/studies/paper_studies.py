@@ -31,7 +31,7 @@ from sparsestyle_ns.studies.study_options import CompareOptions, StudyOptions
 from sparsestyle_ns.studies.study_page import Captioned, Plot, Section, study_page
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.files import prepare_output, write_output
+from sparsestyle_ns.utils.files import keep_former, prepare_output, write_output
 
 PAPER_ROWS: Dict[str, Tuple[float, ...]] = {
     "AdaIN": (0.189, 0.618, 0.276, 0.231, 0.601, 0.295),
@@ -288,7 +288,7 @@ def check_options(options: StudyOptions) -> PaperRuns:
         raise InputError(f"--jobs is {options.jobs}; at least one run at a time is needed.")
     for painting in options.style_images:
         Painting.read(painting)
-    prepare_output(options.output_path, "The page", "index.html", options.force)
+    prepare_output(options.output_path, "The page", "index.html", force=True)
     named = ("draft", "max_image_side", "coarse_iterations", "style_iterations")
     flags = {name: tuple(shlex.split(getattr(options, name))) for name in ("coarse_flags", "style_flags")}
     study = Study(options.data, dataparser, **{name: getattr(options, name) for name in named}, **flags)
@@ -311,4 +311,5 @@ def _write_page(title: str, options: StudyOptions, runs: PaperRuns, sections: Se
         for table in section.tables:
             table.print()
     page = study_page(f"{title}: {runs.study.name}", sections)
+    keep_former(options.output_path, page)
     return write_output(options.output_path, page, "The page", "index.html")

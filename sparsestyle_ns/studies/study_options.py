@@ -7,7 +7,6 @@ from typing import Annotated, List, Literal, Optional, Tuple
 import tyro
 
 from sparsestyle_ns.utils.errors import CommandOptions
-from sparsestyle_ns.utils.files import free_path
 
 Group = Literal["quadrature", "training", "fine-field", "style", "rendering", "precision"]
 
@@ -21,7 +20,7 @@ class StudyOptions(CommandOptions):
     style_images: Tuple[Path, ...]
     """Paintings; each is a table of its own."""
     output_path: Path
-    """The HTML page to write."""
+    """The HTML page to write; one of that name that says something else is kept with a number behind its name."""
     output_dir: Path = Path("outputs/studies")
     """Folder of the runs; those in it are used again. Keep other runs out of it: hier-style takes the newest coarse
     run below its --output-dir, and that must not be an ablation's."""
@@ -42,12 +41,10 @@ class StudyOptions(CommandOptions):
     """The same for all runs of stage 2: --style-flags='--flag value'."""
     jobs: Optional[int] = None
     """Runs at a time; None: one, or one for every four CPU cores where there is no GPU."""
-    force: bool = False
-    """Write over the page, if there is one of that name."""
 
     def ablate_command(self) -> List[object]:
         """The command that runs the ablations on the same runs."""
-        other = replace(self, output_path=free_path(self.output_path.with_name("ablate.html")), force=False)
+        other = replace(self, output_path=self.output_path.with_name("ablate.html"))
         command: List[object] = ["sparsestyle", "ablate", "--data", other.data, "--style-images", *other.style_images]
         command += ["--output-path", other.output_path]
         for each in fields(StudyOptions)[3:]:

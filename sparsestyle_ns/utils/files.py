@@ -59,10 +59,14 @@ def free_path(path: Path) -> Path:
 
 
 def keep_former(path: Path, content: str) -> Optional[Path]:
-    """Gives a file another name, and returns that, if its content isn't the one that takes its place."""
+    """Gives a file another name, says so and returns it, if its content isn't the one that takes its place."""
     if not path.is_file() or path.read_text(encoding="utf-8", errors="replace") == content:
         return None
-    return path.rename(free_path(path))
+    from sparsestyle_ns.utils.progress import say  # loads torch, for which checks of options have no time
+
+    former = path.rename(free_path(path))
+    say(f"What {path} said before is kept as {former}.")
+    return former
 
 
 def prepare_output(output_path: Path, what: str, example: str, force: bool = False) -> None:
