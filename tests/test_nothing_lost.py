@@ -79,6 +79,14 @@ def test_what_is_said_of_a_taken_folder_can_be_done(run: Path, llff_scene: Path)
     assert steps(run.with_name("second")) == [0]
 
 
+@pytest.mark.parametrize("flags", [["--num-views", "2"], ["--max-num-iterations", "3"], ["--previews", "2"]])
+def test_a_run_that_isnt_gone_on_with_stays_as_it_is(run: Path, llff_scene: Path, flags: List[str]) -> None:
+    before = files_below(run)
+    with pytest.raises(SystemExit, match="Error: "):
+        train_again(run, llff_scene, "--load-dir", str(run / "nerfstudio_models"), *flags)
+    assert files_below(run) == before
+
+
 def test_a_run_isnt_gone_on_with_from_before_its_newest_checkpoint_in_its_own_folder(
     run: Path, llff_scene: Path
 ) -> None:

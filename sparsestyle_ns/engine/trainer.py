@@ -73,10 +73,11 @@ class SparseStyleTrainerConfig(RunConfig):
                 f"--machine.device-type is cuda and --machine.num-devices {machine.num_devices}, but torch finds "
                 f"{gpus or 'no'} GPU{'s' * (gpus > 1)} here; {advice}"
             )
-        self.find_place()
+        is_new = self.find_place()
         if machine.num_devices * machine.num_machines > 1:
             prepare_launch()
-        self.write_config()
+        if is_new:  # what a run that is gone on with says stays until it is known that it can be
+            self.write_config()
 
 
 def run_notes(effects: Decisions, record: Optional[SceneRecord]) -> CheckpointNotes:
@@ -104,6 +105,10 @@ class SparseStyleTrainer(Trainer, ABC):
         self._own_checkpoint: Optional[Path] = None
         self.record: Optional[SceneRecord] = None
         if self.resumed is not None:
+            done, total = self.resumed["step"] + 1, self.config.max_num_iterations
+            if done >= total:
+                of = f"The checkpoint is of iteration {done}"
+                raise InputError(f"{of}, and --max-num-iterations is {total}; raise it to train on.")
             self.config.pipeline.datamanager.expected = self._expected_scene()
         if self.resumed is not None and "effects" in self.resumed:
             decided = Decisions.from_records(self.resumed["effects"])
@@ -179,9 +184,6 @@ class SparseStyleTrainer(Trainer, ABC):
         Returns whether training came to its end.
         """
         total = self.config.max_num_iterations
-        if self._start_step >= total:
-            done = f"The checkpoint is of iteration {self._start_step}"
-            raise InputError(f"{done}, and --max-num-iterations is {total}; raise it to train on.")
         self._interrupted = False
         former = signal.signal(signal.SIGINT, self._on_interrupt)
         has_table = self.config.logging.local_writer.enable  # nerfstudio's, which would write over the bar
