@@ -19,10 +19,12 @@ from typing import Annotated, List, Literal, Optional, Sequence
 import tyro
 from _command_line import check_ranges, parse, print_made
 from _flight import flight
-from _stages import Stage, StageFailedError, clock, run_stages
+from _stages import NOTES, Stage, StageFailedError, clock, run_stages
 
 SCRIPTS = Path(__file__).resolve().parent
 COARSE, STYLE = "coarse-fewshot-draft", "hier-style-draft"
+PRODUCTS = ("scene", "style.png", "outputs", "camera_path.json", "stylised.mp4", "index.html")
+"""What the demo writes into its folder."""
 CHECKPOINTS = "outputs/*/{}/*/nerfstudio_models/*.ckpt"
 DRAFT = tyro.conf.arg(metavar="INT", help_behavior_hint="(default: the draft's own)")
 
@@ -90,6 +92,15 @@ def make_stages(options: Options) -> List[Stage]:
     ]
 
 
+def claim_folder(folder: Path) -> None:
+    """Makes the demo's folder; StageFailedError where files there that aren't the demo's would be written over."""
+    notes = folder / NOTES
+    taken = [name for name in PRODUCTS if (folder / name).exists()]
+    if taken and not notes.is_dir():
+        raise StageFailedError(f"{folder} has a {taken[0]} that isn't the demo's; name a new folder with --output.")
+    notes.mkdir(parents=True, exist_ok=True)
+
+
 def train_command(method: str, flags: List[str], scene: Path, outputs: Path, iterations: Optional[int]) -> List[str]:
     """ns-train for a sample scene, without a viewer and with a log that can be piped."""
     command = ["ns-train", method, *flags, "--data", str(scene), "--output-dir", str(outputs)]
@@ -118,7 +129,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     start = time.monotonic()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the command that is under way ends too
     try:
-        options.output.mkdir(parents=True, exist_ok=True)
+        claim_folder(options.output)
         durations = run_stages(options.output, make_stages(options), options.force)
     except StageFailedError as error:
         print(f"\nError: {error}", file=sys.stderr)

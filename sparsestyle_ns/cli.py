@@ -5,7 +5,6 @@ A subcommand is a class of options, whose docstrings are its help, and a functio
 
 import importlib
 import sys
-from dataclasses import fields
 from typing import Dict, List, Optional, Sequence, Set, Tuple, Type
 
 import tyro
@@ -33,8 +32,8 @@ SUBCOMMANDS: Dict[str, Tuple[Type[CommandOptions], str]] = {
 
 def with_dashes(arguments: List[str]) -> List[str]:
     """The command line with the two dashes behind which a dataparser's own options come, where they were left out."""
-    options, _ = SUBCOMMANDS.get(arguments[0] if arguments else "", (CommandOptions, ""))
-    if "--" in arguments or not any(each.name == "dataparser" for each in fields(options)):
+    options, _ = SUBCOMMANDS.get(arguments[0] if arguments else "", (None, ""))
+    if options is None or "--" in arguments or not hasattr(options, "dataparser"):
         return arguments
     for place, (before, word, after) in enumerate(zip(arguments, arguments[1:], arguments[2:], strict=False), start=1):
         if not before.startswith("-") and after.startswith("--") and word in dataparser_names():

@@ -1,5 +1,7 @@
 """What a command saved stays: another one takes a new name, or is told that what is there may be lost."""
 
+import contextlib
+import copy
 import json
 import re
 import shlex
@@ -14,11 +16,19 @@ from test_commands import press_ctrl_c_at
 from test_other_data import files_below, ns_command, refused
 
 from sparsestyle_ns.cli import main
+from sparsestyle_ns.evaluation import held_out
+from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.studies.study_options import CompareOptions
 from sparsestyle_ns.studies.tradeoff_report import report_folder
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import free_path
+
+
+@pytest.fixture(autouse=True)
+def plain_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports have PSNR alone: to load the networks of other figures takes longer than the rest of these tests."""
+    monkeypatch.setattr(held_out, "image_metrics", lambda render, photo: {"psnr": psnr(render, photo)})
 
 
 @pytest.fixture
@@ -52,9 +62,7 @@ def load_config(run: Path) -> None:
 @pytest.mark.parametrize("iterations", ["2", "3", "5"])
 def test_a_run_never_takes_the_folder_of_another(run: Path, llff_scene: Path, iterations: str) -> None:
     before = files_below(run)
-    with pytest.raises(
-        SystemExit, match=r"There is a run in .*first already; name a new one with --timestamp, or go on"
-    ):
+    with pytest.raises(SystemExit, match=r"There is a run in .*first already; name a new one with --timestamp, or"):
         train_again(run, llff_scene, "--max-num-iterations", iterations)
     assert files_below(run) == before
 
@@ -69,6 +77,14 @@ def test_what_is_said_of_a_taken_folder_can_be_done(run: Path, llff_scene: Path)
         *("coarse-fewshot", llff_scene, run.parents[2], "--timestamp", "second", "--max-num-iterations", "1"), *TINY
     )
     assert steps(run.with_name("second")) == [0]
+
+
+@pytest.mark.parametrize("flags", [["--num-views", "2"], ["--max-num-iterations", "3"], ["--previews", "2"]])
+def test_a_run_that_isnt_gone_on_with_stays_as_it_is(run: Path, llff_scene: Path, flags: List[str]) -> None:
+    before = files_below(run)
+    with pytest.raises(SystemExit, match="Error: "):
+        train_again(run, llff_scene, "--load-dir", str(run / "nerfstudio_models"), *flags)
+    assert files_below(run) == before
 
 
 def test_a_run_isnt_gone_on_with_from_before_its_newest_checkpoint_in_its_own_folder(
@@ -90,7 +106,7 @@ def test_the_config_of_a_finished_run_begins_another_one(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     before = files_below(run)
-    with monkeypatch.context() as patch:
+    with monkeypatch.context() as patch, contextlib.suppress(SystemExit):
         press_ctrl_c_at(patch, step=1)
         load_config(run)
     assert files_below(run) == before
@@ -110,7 +126,7 @@ def test_runs_that_begin_in_one_second_have_folders_of_their_own(tmp_path: Path)
 
     names = []
     for _ in range(2):
-        config = method_config("coarse-fewshot")
+        config = copy.deepcopy(method_config("coarse-fewshot"))
         config.output_dir, config.data, config.timestamp = tmp_path, Path("fern"), "{timestamp}"
         config.set_timestamp()
         config.get_base_dir().mkdir(parents=True)
@@ -121,12 +137,12 @@ def test_runs_that_begin_in_one_second_have_folders_of_their_own(tmp_path: Path)
 def test_a_report_of_something_else_is_kept_under_another_name(run: Path, capsys: pytest.CaptureFixture) -> None:
     (run / "evaluation.json").write_text("mine")
     main(["evaluate", str(run)])
-    assert (run / "evaluation 2.json").read_text() == "mine"
-    assert f"kept as {run / 'evaluation 2.json'}" in " ".join(capsys.readouterr().out.split())
+    assert (run / "evaluation-2.json").read_text() == "mine"
+    assert f"kept as {run / 'evaluation-2.json'}" in " ".join(capsys.readouterr().out.split())
     report = (run / "evaluation.json").read_text()
     main(["evaluate", str(run)])  # says the same again, so nothing is lost
     assert (run / "evaluation.json").read_text() == report
-    assert not (run / "evaluation 3.json").exists()
+    assert not (run / "evaluation-3.json").exists()
 
 
 def outputs_of(runs: SimpleNamespace, target: Path) -> Dict[str, List[str]]:
@@ -137,25 +153,21 @@ def outputs_of(runs: SimpleNamespace, target: Path) -> Dict[str, List[str]]:
         "gallery": ["gallery", str(runs.style), "--output-path", str(target), *few],
         "points": ["export", str(runs.style), "--format", "ply", "--output-path", str(target)],
         "page": ["export", str(runs.style), "--output-path", str(target)],
-        "compare": ["compare", "--output-path", str(target)],
-        "ablate": ["ablate", "--output-path", str(target)],
     }
 
 
-@pytest.mark.parametrize("what", ["report", "gallery", "points", "page", "compare", "ablate"])
+@pytest.mark.parametrize("what", ["report", "gallery", "points", "page"])
 def test_a_file_that_is_there_is_written_over_only_where_that_is_asked_for(
-    runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path, what: str
+    runs: SimpleNamespace, tmp_path: Path, what: str
 ) -> None:
     target = tmp_path / "made.html"
     target.write_text("mine")
     arguments = outputs_of(runs, target)[what]
-    if what in ("compare", "ablate"):
-        arguments += ["--data", str(llff_scene), "--style-images", str(painting)]
     message = refused(arguments)
-    other = tmp_path / "made 2.html"
+    other = tmp_path / "made-2.html"
     assert message.endswith(f"is there already; name another file, such as {other}, or write over it with --force.")
     assert target.read_text() == "mine"
-    if what in ("report", "gallery", "points"):  # the others take longer and write by the same function
+    if what != "page":  # which takes longer, and is written by the same function
         main([str(other) if part == str(target) else part for part in arguments])
         assert other.exists() and target.read_text() == "mine"
         main([*arguments, "--force"])
@@ -169,8 +181,8 @@ def test_a_gallery_without_a_name_gets_one_of_its_own(
     for name in ("gallery.html", "scene.html"):
         Path(name).write_text("mine")
     main(["gallery", str(runs.style), "--num-views", "1", "--frames", "0"])
-    assert Path("gallery.html").read_text() == "mine" and Path("gallery 2.html").is_file()
-    assert capsys.readouterr().out.splitlines()[-1].endswith("--output-path 'scene 2.html'")
+    assert Path("gallery.html").read_text() == "mine" and Path("gallery-2.html").is_file()
+    assert capsys.readouterr().out.splitlines()[-1].endswith("--output-path scene-2.html")
 
 
 def test_a_tradeoff_report_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,8 +190,8 @@ def test_a_tradeoff_report_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert report_folder(None, force=False) == Path("tradeoff")
     (tmp_path / "tradeoff").mkdir()
     (tmp_path / "tradeoff" / "tradeoff.csv").touch()
-    assert report_folder(None, force=False) == Path("tradeoff 2")
-    with pytest.raises(InputError, match=r"tradeoff already .*such as tradeoff 2, or write over it with --force"):
+    assert report_folder(None, force=False) == Path("tradeoff-2")
+    with pytest.raises(InputError, match=r"tradeoff already .*such as tradeoff-2, or write over it with --force"):
         report_folder(Path("tradeoff"), force=False)
     assert report_folder(Path("tradeoff"), force=True) == Path("tradeoff")
     (tmp_path / "mine").mkdir()
@@ -187,20 +199,24 @@ def test_a_tradeoff_report_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert report_folder(Path("mine"), force=False) == Path("mine")  # a folder may have other files
 
 
-def test_the_page_after_a_comparison_has_a_name_of_its_own(tmp_path: Path) -> None:
-    (tmp_path / "ablate.html").touch()
-    options = CompareOptions(tmp_path, (Path("a.png"),), tmp_path / "compare.html", force=True)
-    command = list(map(str, options.ablate_command()))
-    assert command[command.index("--output-path") + 1] == str(tmp_path / "ablate 2.html")
-    assert not any("force" in part for part in command)
+def test_a_studys_page_that_said_something_else_is_kept(tmp_path: Path) -> None:
+    from sparsestyle_ns.studies.paper_studies import _write_page
+
+    options = CompareOptions(tmp_path, (Path("a.png"),), tmp_path / "compare.html")
+    options.output_path.write_text("mine")
+    runs = SimpleNamespace(study=SimpleNamespace(name="fern"))
+    for _ in range(2):  # the second page is the first
+        assert _write_page("Comparison", options, runs, []) == options.output_path.resolve()
+    assert {path.name for path in tmp_path.iterdir()} == {"compare.html", "compare-2.html"}
+    assert (tmp_path / "compare-2.html").read_text() == "mine"
 
 
 def test_free_names_keep_suffixes_and_count_on(tmp_path: Path) -> None:
     assert free_path(tmp_path / "a.tar.gz") == tmp_path / "a.tar.gz"
-    for name in ("a.html", "a 2.html", "folder"):
+    for name in ("a.html", "a-2.html", "folder"):
         (tmp_path / name).touch()
-    assert free_path(tmp_path / "a.html") == tmp_path / "a 3.html"
-    assert free_path(tmp_path / "folder") == tmp_path / "folder 2"
+    assert free_path(tmp_path / "a.html") == tmp_path / "a-3.html"
+    assert free_path(tmp_path / "folder") == tmp_path / "folder-2"
 
 
 def test_a_painting_is_painted_over_only_where_that_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

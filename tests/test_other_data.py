@@ -14,16 +14,28 @@ import yaml
 from conftest import TINY, TINY_STYLE, ns_train, only_run, run_entrypoint
 from hypothesis import given
 from hypothesis import strategies as st
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
+from test_commands import write_ring, write_transforms
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
+from sparsestyle_ns.engine.hints import after_evaluation
 from sparsestyle_ns.engine.loading import load_run
+from sparsestyle_ns.evaluation import held_out
 from sparsestyle_ns.evaluation.held_out import saved_report
+from sparsestyle_ns.metrics.image import psnr
+from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.runs.checkpoints import newest_checkpoint
-from sparsestyle_ns.runs.scene_record import RECORD_FILE, SceneRecord
+from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord, record_scene
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.utils.errors import InputError
+
+
+@pytest.fixture(autouse=True)
+def plain_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports have PSNR alone: to load the networks of other figures takes longer than the rest of these tests."""
+    monkeypatch.setattr(held_out, "image_metrics", lambda render, photo: {"psnr": psnr(render, photo)})
 
 
 @pytest.fixture
@@ -103,7 +115,9 @@ change_by_name = pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES
 
 
 def files_below(folder: Path) -> Dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    """Their contents, but for what a training in this process may still write for tensorboard."""
+    files = (path for path in folder.rglob("*") if path.is_file() and "tfevents" not in path.name)
+    return {path: path.read_bytes() for path in files}
 
 
 def refused(arguments: List[str]) -> str:
@@ -159,7 +173,7 @@ def test_a_run_on_a_relative_path_is_measured_on_its_own_scene_from_everywhere(
     other = shutil.copytree(project.scene, tmp_path / "other" / "data" / "llff")
     replace_scene(other)
     monkeypatch.chdir(project.root)
-    ns_train("coarse-fewshot", Path("data/llff"), Path("outputs/new"), "--max-num-iterations", "1", *TINY)
+    ns_train("coarse-fewshot", Path("data/llff"), project.root / "outputs" / "new", "--max-num-iterations", "1", *TINY)
     run = only_run(project.root / "outputs" / "new", "coarse-fewshot")
     as_before = shutil.copytree(run, run.with_name("earlier"))
     config = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader)
@@ -180,7 +194,7 @@ def test_every_tool_reads_the_run_that_was_named_after_a_project_has_moved(
     moved = shutil.copytree(project.root, tmp_path / "deeper" / "down" / "moved")
     checkpoint = newest_checkpoint(project.coarse / "nerfstudio_models")
     state = torch.load(checkpoint, weights_only=True)
-    state["pipeline"]["_model.field.color_head.bias"].fill_(9.0)
+    state["pipeline"]["_model.field.density_head.bias"].fill_(9.0)
     torch.save(state, checkpoint)
     replace_scene(project.scene)
     monkeypatch.chdir(tmp_path)
@@ -192,6 +206,8 @@ def test_every_tool_reads_the_run_that_was_named_after_a_project_has_moved(
     ours, theirs = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("ours", "theirs"))
     assert theirs["checkpoint"] == str(run / "nerfstudio_models" / checkpoint.name)
     assert ours["results"].items() <= theirs["results"].items()
+    command = after_evaluation(run, stylised=False)
+    assert command[command.index("--data") + 1] == str(moved / "data" / "llff") and "--output-dir" not in command
     _, pipeline, _ = load_run(moved / project.style.relative_to(project.root) / "config.yml")
     assert pipeline.config.style_image == moved / "painting.png"
 
@@ -280,7 +296,6 @@ def test_nothing_is_measured_against_a_painting_that_has_changed(
 
 
 def test_a_coarse_run_of_photos_that_have_changed_isnt_stylised(project: SimpleNamespace) -> None:
-    from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
     from sparsestyle_ns.runs.coarse_run import find_coarse_run
 
     change_photo(project.scene)
@@ -302,7 +317,7 @@ def test_a_report_of_other_weights_isnt_shown_as_the_runs_own(project: SimpleNam
     assert saved_report(project.coarse, 2) is not None
     checkpoint = newest_checkpoint(project.coarse / "nerfstudio_models")
     state = torch.load(checkpoint, weights_only=True)
-    state["pipeline"]["_model.field.color_head.bias"].fill_(9.0)
+    state["pipeline"]["_model.field.density_head.bias"].fill_(9.0)
     torch.save(state, checkpoint)
     assert saved_report(project.coarse, 2) is None
 
@@ -351,3 +366,62 @@ def test_a_scene_is_found_where_it_is_or_refused_never_another(
     else:
         assert os.path.samefile(loaded.find_data(folder), scene)
         assert (loaded.find_data(folder) / "mark").exists()
+
+
+@pytest.fixture(scope="module")
+def ring(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six photos from all around with their transforms.json."""
+    folder = tmp_path_factory.mktemp("ring") / "scene"
+    write_transforms(folder, write_ring(folder))
+    return folder
+
+
+def reorder(content: Dict, place: int, amount: float) -> None:
+    """nerfstudio sorts frames by the names of their photos."""
+    content["frames"] = content["frames"][place:] + content["frames"][:place]
+
+
+def drop(content: Dict, place: int, amount: float) -> None:
+    del content["frames"][place]
+
+
+def move(content: Dict, place: int, amount: float) -> None:
+    content["frames"][place]["transform_matrix"][0][3] += amount
+
+
+def exchange(content: Dict, place: int, amount: float) -> None:
+    one, other = content["frames"][place], content["frames"][(place + 1) % 6]
+    one["file_path"], other["file_path"] = other["file_path"], one["file_path"]
+
+
+def hold_out(content: Dict, place: int, amount: float) -> None:
+    names = [frame["file_path"] for frame in content["frames"]]
+    content["train_filenames"] = names[:place] + names[place + 1 :]
+    content["val_filenames"] = content["test_filenames"] = [names[place]]
+
+
+def leave(content: Dict, place: int, amount: float) -> None:
+    """No change."""
+
+
+@given(
+    change=st.sampled_from([leave, reorder, drop, move, exchange, hold_out]),
+    place=st.integers(0, 5),
+    amount=st.floats(0.05, 1.0),
+)
+def test_a_transforms_file_that_says_something_else_is_refused(
+    ring: Path, tmp_path_factory: pytest.TempPathFactory, change: Callable, place: int, amount: float
+) -> None:
+    scene = shutil.copytree(ring, tmp_path_factory.mktemp("changed") / "scene")
+    config = FewShotDataManagerConfig(data=scene, dataparser=NerfstudioDataParserConfig(), max_image_side=None)
+    manager = config.setup(device="cpu", test_mode="test")
+    outputs = manager.train_dataparser_outputs, None, manager.measured_views()
+    config.expected = ExpectedScene(record_scene(scene, *outputs), "The run", "see to it")
+    content = json.loads((scene / "transforms.json").read_text())
+    change(content, place, amount)
+    (scene / "transforms.json").write_text(json.dumps(content))
+    if change in (leave, reorder):
+        config.setup(device="cpu", test_mode="test")
+    else:
+        with pytest.raises(InputError, match=r"The run doesn't fit .* as it is now \(.*\); see to it"):
+            config.setup(device="cpu", test_mode="test")

@@ -25,7 +25,7 @@ class EvaluateOptions(CommandOptions):
     """The run's folder or its config.yml."""
     output_path: Optional[Path] = None
     """JSON file to write, in the layout of ns-eval; left out, evaluation.json in the run's folder, where another report
-    from before is kept as "evaluation 2.json"."""
+    from before is kept as evaluation-2.json."""
     style_image: Optional[Path] = None
     """Painting to measure a stylised run against, if not the one it was made with; needs --output-path."""
     baked: bool = False

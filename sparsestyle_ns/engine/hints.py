@@ -11,6 +11,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from sparsestyle_ns.effects.decisions import EffectSettings
 from sparsestyle_ns.runs.coarse_run import read_coarse_run
 from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD
+from sparsestyle_ns.runs.scene_record import SceneRecord
 from sparsestyle_ns.utils.files import free_path
 from sparsestyle_ns.utils.progress import say
 
@@ -33,7 +34,13 @@ def ns_train_style(coarse_run: Path, config: TrainerConfig) -> List[str]:
 
 def after_evaluation(run: Path, stylised: bool) -> List[str]:
     """What follows on the measuring of a run, stylised or coarse, given by its folder."""
-    return ["sparsestyle", "gallery", str(run)] if stylised else ns_train_style(run, read_coarse_run(run).config)
+    if stylised:
+        return ["sparsestyle", "gallery", str(run)]
+    config = read_coarse_run(run).config
+    if config.get_base_dir().resolve() != run.resolve():  # it has moved, and its scene perhaps, too
+        config.output_dir = Path("outputs")
+        config.pipeline.datamanager.data = SceneRecord.load(run).find_data(run.resolve())
+    return ns_train_style(run, config)
 
 
 def after_export(run: Path, output_path: Path, format: str) -> List[object]:

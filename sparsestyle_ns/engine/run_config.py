@@ -80,31 +80,32 @@ class RunConfig(TrainerConfig):
             self.timestamp = NO_TIMESTAMP
             super().set_timestamp()
 
-    def find_place(self) -> None:
-        """Makes paths absolute, and sees to it that no run is there yet where this one will be.
+    def find_place(self) -> bool:
+        """Makes paths absolute, and sees to it that no run is there yet where this one will be; returns whether so.
 
-        A config that `--load-config` has read goes on with its own run where that isn't finished, and else begins a new
-        one. InputError where there is a run that this one doesn't go on with.
+        Else it goes on with that run. A config that `--load-config` has read goes on with its own run where that isn't
+        finished, and else begins a new one. InputError where there is a run that this one doesn't go on with.
         """
         self._settle_paths()
         folder, newest = self.get_base_dir(), newest_checkpoint(self.get_checkpoint_dir())
         if newest is None:
-            return
+            return True
         if self.pipeline.decided is not None:  # so it was read from a run's config.yml
             if checkpoint_step(newest) + 1 < self.max_num_iterations:
                 self.load_dir, self.load_step, self.load_checkpoint = newest.parent.resolve(), None, None
                 say(f"The run {folder} isn't finished; going on with it.")
-            else:
-                self.timestamp, self.pipeline.decided = NO_TIMESTAMP, None
-                self.set_timestamp()
-                say(f"The run {folder} is finished and stays as it is; this is a new one, {self.get_base_dir()}.")
-            return
+                return False
+            self.timestamp, self.pipeline.decided = NO_TIMESTAMP, None
+            self.set_timestamp()
+            say(f"The run {folder} is finished and stays as it is; this is a new one, {self.get_base_dir()}.")
+            return True
         resumed = self.resumed_checkpoint()
         if resumed is None or resumed.resolve() != newest.resolve():
             raise InputError(
                 f"There is a run in {folder} already; name a new one with --timestamp, or go on with that one by "
                 f"--load-dir {newest.parent}."
             )
+        return False
 
     def _settle_paths(self) -> None:
         """A run may be opened from another folder, and a shell leaves ~ alone behind an equals sign."""

@@ -24,6 +24,7 @@ from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.engine.hints import finish, ns_train_style, resume_command
 from sparsestyle_ns.engine.previews import preview_steps, write_preview
 from sparsestyle_ns.engine.run_config import RunConfig
+from sparsestyle_ns.engine.schedules import over_iterations
 from sparsestyle_ns.engine.training import check_skipped, training_step
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
@@ -78,13 +79,14 @@ class SparseStyleTrainerConfig(RunConfig):
                 f"--machine.device-type is cuda and --machine.num-devices {machine.num_devices}, but torch finds "
                 f"{gpus or 'no'} GPU{'s' * (gpus > 1)} here; {advice}"
             )
-        self.find_place()
+        is_new = self.find_place()
         if machine.num_devices * machine.num_machines > 1:
             prepare_launch()
         folder = self.get_base_dir()
         if not folder.exists():
             take_away_at_end(lambda: remove_empty_run(folder))
-        self.write_config()
+        if is_new:  # what a run that is gone on with says stays until it is known that it can be
+            self.write_config()
 
 
 def run_notes(effects: Decisions, record: Optional[SceneRecord]) -> CheckpointNotes:
@@ -112,11 +114,17 @@ class SparseStyleTrainer(Trainer, ABC):
         self._own_checkpoint: Optional[Path] = None
         self.record: Optional[SceneRecord] = None
         if self.resumed is not None:
+            done, total = self.resumed["step"] + 1, self.config.max_num_iterations
+            if done >= total:
+                of = f"The checkpoint is of iteration {done}"
+                raise InputError(f"{of}, and --max-num-iterations is {total}; raise it to train on.")
             self.config.pipeline.datamanager.expected = self._expected_scene()
         if self.resumed is not None and "effects" in self.resumed:
             decided = Decisions.from_records(self.resumed["effects"])
             decided.check_choices(self.config.pipeline.effects, f"the checkpoint {self.config.resumed_checkpoint()}")
             self.config = replace(self.config, pipeline=replace(self.config.pipeline, decided=decided))
+        if self.config.data is not None and not os.access(self.config.data, os.W_OK):
+            self.config = replace(self.config, data=None)  # where nerfstudio's viewer would make a folder
         super().setup(test_mode)
         manager = self.pipeline.datamanager
         manager.config.expected = None  # it is that scene
@@ -144,7 +152,8 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def setup_optimizers(self) -> FiniteOptimizers:
         """Optimisers that skip steps whose gradient isn't finite."""
-        return FiniteOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
+        optimizers = over_iterations(self.config.optimizers, self.config.max_num_iterations)
+        return FiniteOptimizers(optimizers, self.pipeline.get_param_groups())
 
     def _save_decisions(self) -> None:
         self.pipeline.effects.save(self.base_dir)
@@ -186,9 +195,6 @@ class SparseStyleTrainer(Trainer, ABC):
         Returns whether nobody pressed it.
         """
         total = self.config.max_num_iterations
-        if self._start_step >= total:
-            done = f"The checkpoint is of iteration {self._start_step}"
-            raise InputError(f"{done}, and --max-num-iterations is {total}; raise it to train on.")
         self._interrupted = self._waits = False
         self._interrupted_at: Optional[float] = None
         former = signal.signal(signal.SIGINT, self._on_interrupt)

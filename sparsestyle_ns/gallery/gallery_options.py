@@ -23,7 +23,7 @@ class GalleryOptions(CommandOptions):
     runs: Annotated[Tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
     """Stylised runs to show, each by its folder or its config.yml."""
     output_path: Optional[Path] = None
-    """The page to write; left out, gallery.html here, or "gallery 2.html" where that is there already."""
+    """The page to write; left out, gallery.html here, or gallery-2.html where that is there already."""
     video: Tuple[Path, ...] = ()
     """MP4 files, as ns-render writes them, to show instead of films made here: one for each run, in the same order."""
     title: str = "Stylised scenes"

@@ -20,6 +20,7 @@ from sparsestyle_ns.gallery.gallery_options import GalleryOptions
 from sparsestyle_ns.gallery.layout import Film, Picture, RunPictures, View, gallery_page, thumbnail
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig
 from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config
+from sparsestyle_ns.runs.scene_record import ExpectedScene
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import free_path, write_output
@@ -75,7 +76,7 @@ def collect_run(
         photos=photos,
         views=views,
         style_name="" if painting is None else painting.stem,
-        style=_style_picture(painting),
+        style=_style_picture(painting, pipeline.datamanager.config.expected),
         style_note=f"The style image, {painting}, is no longer there.",
         film=film,
         tables=[_views_table(measured)] if report is None else report_tables(report.means, len(report.views)),
@@ -137,15 +138,17 @@ def _photo(dataset: PhotoDataset, index: int) -> Pixels:
     return thumbnail(dataset.get_image_uint8(index)[..., :3].numpy(), LONGEST_SIDE)
 
 
-def _style_picture(path: Optional[Path]) -> Optional[Picture]:
-    """The painting, where its file is still there."""
+def _style_picture(path: Optional[Path], expected: Optional[ExpectedScene]) -> Optional[Picture]:
+    """The painting, where its file is still there; its caption says where that is another picture by now."""
     if path is None:
         return None
     try:
-        pixels = Painting.read(path).pixels
+        painting = Painting.read(path)
     except InputError:
         return None
-    return Picture(thumbnail(as_pixels(pixels.permute(1, 2, 0).numpy()), LONGEST_SIDE), path.name)
+    is_other = expected is not None and expected.record.painting not in (None, painting.digest)
+    pixels = thumbnail(as_pixels(painting.pixels.permute(1, 2, 0).numpy()), LONGEST_SIDE)
+    return Picture(pixels, path.name + ", which is another picture by now" * is_other)
 
 
 def _views_table(views: Sequence[Dict[str, float]]) -> Table:
@@ -159,10 +162,10 @@ def _views_table(views: Sequence[Dict[str, float]]) -> Table:
 def _settings(config: TrainerConfig, dataset: PhotoDataset, photo_side: int, step: int) -> List[Tuple[str, str]]:
     pipeline: HierStylePipelineConfig = config.pipeline
     height, width = int(dataset.cameras.height[0]), int(dataset.cameras.width[0])
-    side, weight = pipeline.feature_side or photo_side, pipeline.loss_weights["content"]
+    weight = pipeline.loss_weights["content"]
     sizes, weights = [], []
     for level in pipeline.levels(config.max_num_iterations):
-        sizes.append(f"{round(level.scale * side)} pixels in {level.length} iterations")
+        sizes.append(f"{pipeline.side_at(level.scale, photo_side)} pixels in {level.length} iterations")
         first, last = (
             pipeline.weights_at(at, level)["content"] if weight > 0 else 0.0
             for at in (level.first, level.first + level.length)

@@ -7,7 +7,6 @@ from typing import Annotated, List, Literal, Optional, Tuple
 import tyro
 
 from sparsestyle_ns.utils.errors import CommandOptions
-from sparsestyle_ns.utils.files import free_path
 
 Group = Literal["quadrature", "training", "fine-field", "style", "rendering", "precision"]
 
@@ -21,7 +20,7 @@ class StudyOptions(CommandOptions):
     style_images: Tuple[Path, ...]
     """Paintings; each is a table of its own."""
     output_path: Path
-    """The HTML page to write."""
+    """The HTML page to write; one of that name that says something else is kept with a number behind its name."""
     output_dir: Path = Path("outputs/studies")
     """Folder of the runs; those in it are used again. Keep other runs out of it: hier-style takes the newest coarse
     run below its --output-dir, and that must not be an ablation's."""
@@ -42,15 +41,13 @@ class StudyOptions(CommandOptions):
     """The same for all runs of stage 2: --style-flags='--flag value'."""
     jobs: Optional[int] = None
     """Runs at a time; None: one, or one for every four CPU cores where there is no GPU."""
-    force: bool = False
-    """Write over the page, if there is one of that name."""
 
     def ablate_command(self) -> List[object]:
         """The command that runs the ablations on the same runs."""
-        other = replace(self, output_path=free_path(self.output_path.with_name("ablate.html")), force=False)
+        other = replace(self, output_path=self.output_path.with_name("ablate.html"))
         command: List[object] = ["sparsestyle", "ablate", "--data", other.data, "--style-images", *other.style_images]
         command += ["--output-path", other.output_path]
-        for each in fields(other)[3:]:
+        for each in fields(StudyOptions)[3:]:
             value, flag = getattr(other, each.name), f"--{each.name.replace('_', '-')}"
             if value != each.default:
                 command.append(flag if value is True else f"{flag}={value}")
@@ -65,6 +62,9 @@ class CompareOptions(StudyOptions):
     the optical flow, fine-tuning the coarse field (ARF's kind), a FreeNeRF-style field fine-tuned, and ours.
     Interrupted, the same command goes on where it was.
     """
+
+    front: bool = False
+    """Draw style against kept content instead: several content weights of each way of stylising, all in equal time."""
 
 
 @dataclass
@@ -96,7 +96,7 @@ class TradeoffOptions(CommandOptions):
     budget: str = "10m"
     """Time that it may take, such as 90s, 10m or 1h30m. More of it gives longer runs and more repetitions."""
     output_dir: Optional[Path] = None
-    """Folder of the report; left out, tradeoff here, or "tradeoff 2" where that is there already."""
+    """Folder of the report; left out, tradeoff here, or tradeoff-2 where that is there already."""
     coarse_run: Optional[Path] = None
     """Folder of a coarse-fewshot run of this scene to render; left out, one is trained in a part of the time."""
     max_image_side: Optional[int] = None

@@ -52,15 +52,21 @@ def digest(*contents: bytes) -> str:
 
 def free_path(path: Path) -> Path:
     """A path at which nothing is yet: this, else with a number behind the name."""
-    taken = {each.stem if path.suffix else each.name for each in path.parent.glob("*")} if path.exists() else ()
-    return path.with_name(free_name(path.stem if path.suffix else path.name, taken) + path.suffix)
+    found, number = path, 2
+    while found.exists():
+        found, number = path.with_name(f"{path.stem}-{number}{path.suffix}"), number + 1
+    return found
 
 
 def keep_former(path: Path, content: str) -> Optional[Path]:
-    """Gives a file another name, and returns that, if its content isn't the one that takes its place."""
+    """Gives a file another name, says so and returns it, if its content isn't the one that takes its place."""
     if not path.is_file() or path.read_text(encoding="utf-8", errors="replace") == content:
         return None
-    return path.rename(free_path(path))
+    from sparsestyle_ns.utils.progress import say  # loads torch, for which checks of options have no time
+
+    former = path.rename(free_path(path))
+    say(f"What {path} said before is kept as {former}.")
+    return former
 
 
 def prepare_output(output_path: Path, what: str, example: str, force: bool = False) -> None:
