@@ -5,15 +5,18 @@ It reads a camera path only after the pipeline is loaded, and believes whatever 
 
 import json
 import math
+import shutil
 import sys
+import tempfile
 from pathlib import Path
-from typing import Any, Optional
+from typing import Any, Dict, List, Optional
 
 import numpy as np
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
 from sparsestyle_ns.pipelines.nerfstudio_options import render_options
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.interrupts import take_away_at_end
 from sparsestyle_ns.utils.progress import say
 
 AROUND = ("equirectangular", "omnidirectional", "vr180")
@@ -44,10 +47,20 @@ def prepare_render(pipeline: VanillaPipeline) -> None:
         say(line)
     if hasattr(command, "camera_path_filename"):
         content = read_camera_path(Path(command.camera_path_filename).expanduser())
+        command.camera_path_filename = _saved(content)
         if str(content.get("camera_type", "")).lower() in AROUND and pipeline.model.ndc is not None:
             say("The scene is forward-facing: what a camera sees beside and behind the photos' views is empty.")
     if hasattr(command, "pose_source"):
         find_ends(pipeline, command)
+
+
+def _saved(content: Dict[str, Any]) -> Path:
+    """A file with a camera path, for as long as the process runs."""
+    folder = tempfile.mkdtemp(prefix="camera-path-")
+    take_away_at_end(lambda: shutil.rmtree(folder, ignore_errors=True))
+    path = Path(folder) / "camera_path.json"
+    path.write_text(json.dumps(content), encoding="utf-8")
+    return path
 
 
 def find_ends(pipeline: VanillaPipeline, command: Any) -> None:
@@ -67,8 +80,11 @@ def find_ends(pipeline: VanillaPipeline, command: Any) -> None:
         )
 
 
-def read_camera_path(path: Path) -> dict:
-    """A camera path as nerfstudio's viewer writes it; InputError where ns-render couldn't render what is in it."""
+def read_camera_path(path: Path) -> Dict[str, Any]:
+    """A camera path as nerfstudio's viewer writes it; InputError where ns-render couldn't render what is in it.
+
+    Whole numbers, on which nerfstudio ends with an assertion in some places, become floating-point ones there.
+    """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -91,8 +107,12 @@ def read_camera_path(path: Path) -> dict:
         raise InputError(f"{path} has the camera_type {json.dumps(kind)[:60]}: name one of {', '.join(KINDS)}.")
     for index, camera in enumerate(keyframes):
         _check_camera(f"Camera {index} (from 0) of {path}", camera, needs_fov=kind.lower() not in AROUND)
-    _check_crop(path, content.get("crop"))
-    return content
+    crop = content.get("crop")
+    _check_crop(path, crop)
+    keyframes = [{**camera, "camera_to_world": _floats(camera["camera_to_world"])} for camera in keyframes]
+    if crop is not None:
+        crop = {key: _floats(value) if isinstance(value, list) else value for key, value in crop.items()}
+    return {**content, "camera_path": keyframes, "crop": crop}
 
 
 def _check_camera(where: str, camera: Any, needs_fov: bool) -> None:
@@ -124,6 +144,10 @@ def _is_pose(numbers: Any) -> bool:
     if not isinstance(numbers, list) or len(numbers) != 16 or any(math.isnan(_number(value)) for value in numbers):
         return False
     return bool(abs(np.linalg.det(np.array(numbers, dtype=np.float64).reshape(4, 4)[:3, :3])) > 1e-6)
+
+
+def _floats(numbers: List[Any]) -> List[Any]:
+    return [float(number) if isinstance(number, int) else number for number in numbers]
 
 
 def _number(value: Any) -> float:
