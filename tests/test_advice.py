@@ -89,12 +89,14 @@ def place(
 ) -> SimpleNamespace:
     """Paths that commands name, in a folder where nothing is yet; long work is cut short."""
     from nerfstudio.engine.trainer import Trainer
+    from nerfstudio.utils import writer
 
     from sparsestyle_ns.evaluation import held_out
     from sparsestyle_ns.studies import paper_studies, tradeoff
     from sparsestyle_ns.studies.tradeoff_report import Report
 
     monkeypatch.setattr(Trainer, "train", lambda trainer: None)
+    monkeypatch.setattr(writer, "setup_event_writer", lambda *arguments, **settings: None)
     monkeypatch.setattr(held_out, "image_metrics", lambda render, photo: {"psnr": 0.0})
     monkeypatch.setattr(paper_studies, "_run_study", lambda title, options, *rest: options.output_path)
     monkeypatch.setattr(tradeoff, "measure", lambda study, options, budget: Report("fern", {}, []))
