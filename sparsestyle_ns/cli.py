@@ -5,6 +5,7 @@ A subcommand is a class of options, whose docstrings are its help, and a functio
 
 import importlib
 import sys
+from dataclasses import fields
 from typing import Dict, List, Optional, Sequence, Set, Tuple, Type
 
 import tyro
@@ -35,8 +36,10 @@ def with_dashes(arguments: List[str]) -> List[str]:
     options, _ = SUBCOMMANDS.get(arguments[0] if arguments else "", (None, ""))
     if options is None or "--" in arguments or not hasattr(options, "dataparser"):
         return arguments
+    own = {f"--{each.name.replace('_', '-')}" for each in fields(options)}
     for place, (before, word, after) in enumerate(zip(arguments, arguments[1:], arguments[2:], strict=False), start=1):
-        if not before.startswith("-") and after.startswith("--") and word in dataparser_names():
+        is_of_parser = after.startswith("--") and after.split("=")[0].replace("_", "-") not in own
+        if is_of_parser and not before.startswith("-") and word in dataparser_names():
             return [*arguments[:place], "--", *arguments[place:]]
     return arguments
 

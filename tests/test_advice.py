@@ -85,17 +85,22 @@ def test_what_is_printed_names_flags_and_commands_that_exist() -> None:
 
 @pytest.fixture
 def place(
-    runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    runs: SimpleNamespace,
+    llff_scene: Path,
+    painting: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    quick_reports: None,
 ) -> SimpleNamespace:
     """Paths that commands name, in a folder where nothing is yet; long work is cut short."""
     from nerfstudio.engine.trainer import Trainer
+    from nerfstudio.utils import writer
 
-    from sparsestyle_ns.evaluation import held_out
     from sparsestyle_ns.studies import paper_studies, tradeoff
     from sparsestyle_ns.studies.tradeoff_report import Report
 
     monkeypatch.setattr(Trainer, "train", lambda trainer: None)
-    monkeypatch.setattr(held_out, "image_metrics", lambda render, photo: {"psnr": 0.0})
+    monkeypatch.setattr(writer, "setup_event_writer", lambda *arguments, **settings: None)
     monkeypatch.setattr(paper_studies, "_run_study", lambda title, options, *rest: options.output_path)
     monkeypatch.setattr(tradeoff, "measure", lambda study, options, budget: Report("fern", {}, []))
     monkeypatch.chdir(tmp_path)

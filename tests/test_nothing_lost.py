@@ -16,19 +16,13 @@ from test_commands import press_ctrl_c_at
 from test_other_data import files_below, ns_command, refused
 
 from sparsestyle_ns.cli import main
-from sparsestyle_ns.evaluation import held_out
-from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.studies.study_options import CompareOptions
 from sparsestyle_ns.studies.tradeoff_report import report_folder
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import free_path
 
-
-@pytest.fixture(autouse=True)
-def plain_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports have PSNR alone: to load the networks of other figures takes longer than the rest of these tests."""
-    monkeypatch.setattr(held_out, "image_metrics", lambda render, photo: {"psnr": psnr(render, photo)})
+pytestmark = pytest.mark.usefixtures("quick_reports")
 
 
 @pytest.fixture

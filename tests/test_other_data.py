@@ -22,20 +22,14 @@ from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.engine.hints import after_evaluation
 from sparsestyle_ns.engine.loading import load_run
-from sparsestyle_ns.evaluation import held_out
 from sparsestyle_ns.evaluation.held_out import saved_report
-from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord, record_scene
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.utils.errors import InputError
 
-
-@pytest.fixture(autouse=True)
-def plain_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports have PSNR alone: to load the networks of other figures takes longer than the rest of these tests."""
-    monkeypatch.setattr(held_out, "image_metrics", lambda render, photo: {"psnr": psnr(render, photo)})
+pytestmark = pytest.mark.usefixtures("quick_reports")
 
 
 @pytest.fixture

@@ -114,15 +114,7 @@ class SparseStyleTrainer(Trainer, ABC):
         self._own_checkpoint: Optional[Path] = None
         self.record: Optional[SceneRecord] = None
         if self.resumed is not None:
-            done, total = self.resumed["step"] + 1, self.config.max_num_iterations
-            if done >= total:
-                of = f"The checkpoint is of iteration {done}"
-                raise InputError(f"{of}, and --max-num-iterations is {total}; raise it to train on.")
-            self.config.pipeline.datamanager.expected = self._expected_scene()
-        if self.resumed is not None and "effects" in self.resumed:
-            decided = Decisions.from_records(self.resumed["effects"])
-            decided.check_choices(self.config.pipeline.effects, f"the checkpoint {self.config.resumed_checkpoint()}")
-            self.config = replace(self.config, pipeline=replace(self.config.pipeline, decided=decided))
+            self._expect_what_was(self.resumed)
         if self.config.data is not None and not os.access(self.config.data, os.W_OK):
             self.config = replace(self.config, data=None)  # where nerfstudio's viewer would make a folder
         super().setup(test_mode)
@@ -133,6 +125,18 @@ class SparseStyleTrainer(Trainer, ABC):
             self.record = self.completed(record_scene(manager.config.data, *parts))
             self.record.save(self.base_dir)
             self._save_decisions()
+
+    def _expect_what_was(self, before: Dict[str, Any]) -> None:
+        """Takes from a checkpoint what training goes on with; InputError where the command line says something else."""
+        done, total = before["step"] + 1, self.config.max_num_iterations
+        if done >= total:
+            of = f"The checkpoint is of iteration {done}"
+            raise InputError(f"{of}, and --max-num-iterations is {total}; raise it to train on.")
+        self.config.pipeline.datamanager.expected = self._expected_scene()
+        if "effects" in before:
+            decided = Decisions.from_records(before["effects"])
+            decided.check_choices(self.config.pipeline.effects, f"the checkpoint {self.config.resumed_checkpoint()}")
+            self.config = replace(self.config, pipeline=replace(self.config.pipeline, decided=decided))
 
     def completed(self, record: SceneRecord) -> SceneRecord:
         """The record of the scene with what the method adds to it."""
