@@ -3,7 +3,6 @@
 A scene's and a run's folder carry a digest of what decides their content, so that it may be used or gone on with.
 """
 
-import hashlib
 import shlex
 import sys
 from dataclasses import dataclass
@@ -16,11 +15,13 @@ from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD, read_config
 from sparsestyle_ns.stylise.stylise_options import StyliseOptions
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.files import safe_file_name
-from sparsestyle_ns.utils.stages import Command, Stage, StageFailedError, clock, run_stages
+from sparsestyle_ns.utils.files import digest, safe_file_name
+from sparsestyle_ns.utils.stages import FINISHED, Command, Stage, StageFailedError, clock, run_stages
 
 SECONDS = {"default": (15.0, 190.0, 290.0, 100.0, 80.0), "draft": (5.0, 65.0, 60.0, 40.0, 30.0)}
 """What the commands take, about, on two idle cores; the bar needs their ratios."""
+PAGES = ("index.html", "scene.html")
+"""With pictures, and to fly through."""
 SHARE_READ = 1 << 16
 """Bytes of a photo at its beginning, and at its end, that tell it from others."""
 
@@ -29,9 +30,12 @@ def stylise(options: StyliseOptions) -> None:
     """Runs what isn't finished yet, by checked options, and says where to look.
 
     Raises:
-        InputError: a command failed, and said why; or nothing tells which dataparser reads the scene.
+        InputError: a command failed, and said why; or the folder has pages that aren't this command's.
         SystemExit: status 130, after Ctrl-C.
     """
+    taken = [page for page in PAGES if (options.output / page).exists()]
+    if taken and not (options.output / FINISHED).is_dir():
+        raise InputError(f"{options.output} has a {taken[0]} that this command didn't make; name another --output.")
     again = shlex.join(["sparsestyle", *sys.argv[1:]])
     try:
         durations = run_stages(options.output, make_stages(options))
@@ -42,7 +46,7 @@ def stylise(options: StyliseOptions) -> None:
         raise SystemExit(130) from None
     for heading, seconds in durations:
         print(f"  {'before' if seconds is None else clock(seconds):>6}  {heading}")
-    page = options.output / "index.html"
+    page = options.output / PAGES[0]
     finish(page.resolve(), ["python", "-m", "webbrowser", page.resolve().as_uri()])
 
 
@@ -55,17 +59,17 @@ class _Way:
     def __post_init__(self) -> None:
         options = self.options
         self.is_scene = is_scene(options.photos)
-        self.photos = digest(*scene_files(options.photos))
+        self.photos = _short_digest(*scene_files(options.photos))
         self.scene = options.photos.resolve() if self.is_scene else options.output / f"scene-{self.photos}"
         self.outputs = options.output / "outputs"
-        coarse = f"coarse-{digest(self.method(COARSE_METHOD), options.seed, options.device, self.photos)}"
-        style = digest(coarse, hashlib.sha256(options.painting.read_bytes()).hexdigest())
+        coarse = f"coarse-{_short_digest(self.method(COARSE_METHOD), options.seed, options.device, self.photos)}"
+        style = _short_digest(coarse, digest(options.painting.read_bytes()))
         style = f"{safe_file_name(options.painting.stem, 'style')}-{style}"
         self.coarse, self.stylised = (
             self.outputs / self.scene.stem / self.method(kind) / name
             for kind, name in ((COARSE_METHOD, coarse), (STYLE_METHOD, style))
         )
-        self.gallery_page, self.scene_page = options.output / "index.html", options.output / "scene.html"
+        self.gallery_page, self.scene_page = (options.output / page for page in PAGES)
 
     def method(self, kind: str) -> str:
         """The method of a stage, by what the names of its methods start with."""
@@ -104,11 +108,11 @@ class _Way:
 
     def show(self) -> Command:
         """The page of pictures."""
-        return ["sparsestyle", "gallery", str(self.stylised), "--output-path", str(self.gallery_page)]
+        return ["sparsestyle", "gallery", str(self.stylised), "--output-path", str(self.gallery_page), "--force"]
 
     def export(self) -> Command:
         """The page to fly through."""
-        return ["sparsestyle", "export", str(self.stylised), "--output-path", str(self.scene_page)]
+        return ["sparsestyle", "export", str(self.stylised), "--output-path", str(self.scene_page), "--force"]
 
 
 def make_stages(options: StyliseOptions) -> List[Stage]:
@@ -142,10 +146,10 @@ def scene_files(folder: Path) -> List[str]:
             ends = file.read(SHARE_READ)
             file.seek(max(0, path.stat().st_size - SHARE_READ))
             ends += file.read()
-        found += [str(path.relative_to(folder)), str(path.stat().st_size), hashlib.sha256(ends).hexdigest()]
+        found += [str(path.relative_to(folder)), str(path.stat().st_size), digest(ends)]
     return found
 
 
-def digest(*parts: object) -> str:
+def _short_digest(*parts: object) -> str:
     """Eight hexadecimal digits of all of them."""
-    return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()[:8]
+    return digest(*(str(part).encode() for part in parts))[:8]

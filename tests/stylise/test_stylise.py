@@ -175,6 +175,15 @@ def test_other_photos_begin_anew(photos, painting, monkeypatch):
     assert len(list((photos.parent / "out").glob("scene-*"))) == 2
 
 
+def test_pages_of_others_are_not_written_over(photos, painting, monkeypatch):
+    (photos.parent / "out").mkdir()
+    (photos.parent / "out" / "index.html").touch()
+    recorded = Recorded(monkeypatch)
+    with pytest.raises(SystemExit, match="has a index.html that this command didn't make"):
+        stylise(monkeypatch, photos, painting)
+    assert recorded.commands == []
+
+
 def test_a_video_is_prepared(tmp_path, painting):
     (tmp_path / "walk.mp4").write_bytes(b"frames")
     first, *_ = commands_of(StyliseOptions(tmp_path / "walk.mp4", painting, tmp_path / "out"))
