@@ -179,7 +179,7 @@ def test_pages_of_others_are_not_written_over(photos, painting, monkeypatch):
     (photos.parent / "out").mkdir()
     (photos.parent / "out" / "index.html").touch()
     recorded = Recorded(monkeypatch)
-    with pytest.raises(SystemExit, match="has a index.html that this command didn't make"):
+    with pytest.raises(SystemExit, match=r"has a index\.html that this command didn't make"):
         stylise(monkeypatch, photos, painting)
     assert recorded.commands == []
 
