@@ -20,12 +20,12 @@ from torch import Tensor, nn
 from sparsestyle_ns.effects.registry import decide_again
 from sparsestyle_ns.engine.schedules import over_iterations
 from sparsestyle_ns.engine.style_trainer import style_notes
-from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
+from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig, run_notes
 from sparsestyle_ns.engine.training import check_skipped, training_step, warm_start
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleTask
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path, write_checkpoint
 from sparsestyle_ns.runs.run_folder import read_config
-from sparsestyle_ns.runs.scene_record import RECORD_FILE, save_thumbnail
+from sparsestyle_ns.runs.scene_record import SceneRecord, save_thumbnail
 from sparsestyle_ns.style.backbone import Backbone
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.distributed import num_processes
@@ -148,6 +148,8 @@ class Restyling:
             config.pipeline.stroke_size = self.stroke_size
             config.pipeline.style_image, config.pipeline.decided = folder.resolve() / self._painting, self.effects
             write_whole(new / "config.yml", yaml.dump(config))
+            if (record := self._record()) is not None:
+                record.save(new, folder)
             return new.rename(folder)
         finally:
             shutil.rmtree(hidden, ignore_errors=True)
@@ -156,9 +158,9 @@ class Restyling:
         """Writes a run but for its config."""
         write_whole(new / self._painting, self.image.data)
         save_thumbnail(new, self.image)
-        for name in (RECORD_FILE, "dataparser_transforms.json"):  # what says nothing of the style
-            if (self.workshop.folder / name).is_file():
-                shutil.copy(self.workshop.folder / name, new / name)
+        transforms = self.workshop.folder / "dataparser_transforms.json"
+        if transforms.is_file():
+            shutil.copy(transforms, new / transforms.name)
         self.effects.save(new)
         own = {f"_model.residual.{name}": value for name, value in self.field.state_dict().items()}
         path = checkpoint_path(new / self.config.relative_model_dir, self.iterations - 1)
@@ -167,4 +169,12 @@ class Restyling:
 
     def notes(self) -> CheckpointNotes:
         """What its checkpoint says beside the state."""
-        return style_notes(self.pipeline, self.effects, asdict(self.workshop.backbone.description))
+        notes = run_notes(self.effects, self._record())
+        return style_notes(self.pipeline, notes, asdict(self.workshop.backbone.description))
+
+    def _record(self) -> Optional[SceneRecord]:
+        """What is known of the scene, with this painting."""
+        try:
+            return replace(SceneRecord.load(self.workshop.folder), painting=self.image.digest)
+        except InputError:
+            return None

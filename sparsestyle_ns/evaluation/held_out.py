@@ -29,8 +29,9 @@ from sparsestyle_ns.metrics.style_distance import StyleDistance
 from sparsestyle_ns.metrics.warping import MIN_COVERAGE, Pinhole, Surface
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
+from sparsestyle_ns.runs.checkpoints import CHECKPOINT_FOLDER, checkpoint_path
 from sparsestyle_ns.runs.run_folder import REPORT_FILE
-from sparsestyle_ns.utils.files import write_whole
+from sparsestyle_ns.utils.files import digest, keep_former, write_whole
 from sparsestyle_ns.utils.progress import track
 
 EVEN_SAMPLES = 64
@@ -57,17 +58,31 @@ class HeldOutReport:
         found = by_figure(self.views)
         return {f"{key}_std": statistics.stdev(values) for key, values in found.items() if len(values) > 1}
 
-    def save(self, path: Path, experiment: str, method: str, step: int) -> None:
-        """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means."""
+    def save(self, path: Path, experiment: str, method: str, step: int, checkpoint: Optional[Path] = None) -> None:
+        """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means.
+
+        What a run's own report said before, if it was something else, is kept under another name.
+        """
         run = {"experiment_name": experiment, "method_name": method, "step": step}
-        write_whole(path, json.dumps({**run, "results": self.means, "views": self.views}, indent=2) + "\n")
+        if checkpoint is not None:
+            run["checkpoint"] = digest(checkpoint.read_bytes())
+        content = json.dumps({**run, "results": self.means, "views": self.views}, indent=2) + "\n"
+        if path.name == REPORT_FILE:
+            keep_former(path, content)
+        write_whole(path, content)
 
 
 def saved_report(folder: Path, step: int) -> Optional[HeldOutReport]:
-    """The report in a run's folder, where there is one of the checkpoint of iteration `step`."""
+    """The report in a run's folder, where there is one of the checkpoint of iteration `step` as it is now."""
     try:
         content = json.loads((folder / REPORT_FILE).read_text())
-        return HeldOutReport(content["results"], list(content["views"])) if content["step"] == step else None
+        if content["step"] != step:
+            return None
+        if "checkpoint" in content:  # earlier versions said no more than the iteration
+            checkpoint = checkpoint_path(folder / CHECKPOINT_FOLDER, step)
+            if content["checkpoint"] != digest(checkpoint.read_bytes()):
+                return None
+        return HeldOutReport(content["results"], list(content["views"]))
     except (OSError, ValueError, KeyError, TypeError):  # there is none, or another file has its name
         return None
 

@@ -28,10 +28,13 @@ class ExportOptions(CommandOptions):
     """What to write: a page, points or a mesh."""
     resolution: int = 255
     """html: cells along a side of the scene's cube. Every browser with WebGL2 can hold 255."""
+    force: bool = False
+    """Write over the file, if there is one of that name."""
 
     def check(self) -> None:
         """Raises an `InputError` if there is no such run, or the file can't be written."""
         if not 32 <= self.resolution <= 1023:
             raise InputError(f"--resolution {self.resolution} isn't between 32 and 1023; 255 suits most scenes.")
         find_config(self.run, STYLE_METHOD)
-        prepare_output(self.output_path, "The scene", "scene.html" if self.format == "html" else "scene.ply")
+        example = "scene.html" if self.format == "html" else "scene.ply"
+        prepare_output(self.output_path, "The scene", example, self.force)

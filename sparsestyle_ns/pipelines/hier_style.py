@@ -218,11 +218,22 @@ class HierStylePipeline(CheckedPipeline):
         """The painting to measure against, the run's own or another, where it is still there."""
         if self.targets is not None and style_image is None:
             return self.targets
-        path = style_image or self.config.style_image
+        path, expected = style_image or self.config.style_image, self.datamanager.config.expected
         if path is None or not path.is_file():
             say(f"The painting {path} isn't there any more, so nothing is measured against it.")
             return None
-        return self.targets_of(*replace(self.config, style_image=path).load_style())
+        try:
+            painting, backbone = replace(self.config, style_image=path).load_style()
+        except InputError as error:
+            if style_image is not None:  # which was asked for
+                raise
+            say(f"{error.fault}, so nothing is measured against {path}.")
+            return None
+        made_for = None if style_image is not None or expected is None else expected.record.painting
+        if made_for not in (None, painting.digest):
+            say(f"The painting {path} is another picture by now, so nothing is measured against it.")
+            return None
+        return self.targets_of(painting, backbone)
 
     def warm_start_loss(self, task: StyleTask, step: int) -> Dict[str, Float[Tensor, ""]]:
         """How far c_f, on the coarse geometry, is from the content picture of one photo; not in the paper.

@@ -1,11 +1,12 @@
 """`sparsestyle compare` and `ablate`: the runs that the paper sets side by side (Tab. 1, Sec. 4.2), and their page."""
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Dict, List, Mapping, Sequence, Tuple
 
 from sparsestyle_ns.data.parser_choice import parse_dataparser
+from sparsestyle_ns.data.reading import read_scene
 from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.engine.previews import preview_path
 from sparsestyle_ns.evaluation.tables import COARSE_QUALITY, CONSISTENCY, STYLE, STYLE_AND_CONTENT, Table, table_of
@@ -30,7 +31,7 @@ from sparsestyle_ns.studies.study_options import CompareOptions, StudyOptions
 from sparsestyle_ns.studies.study_page import Captioned, Plot, Section, study_page
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.files import prepare_output, write_output
+from sparsestyle_ns.utils.files import keep_former, prepare_output, write_output
 
 PAPER_ROWS: Dict[str, Tuple[float, ...]] = {
     "AdaIN": (0.189, 0.618, 0.276, 0.231, 0.601, 0.295),
@@ -271,14 +272,23 @@ def ablate(options: StudyOptions) -> None:
 
 def check_options(options: StudyOptions) -> PaperRuns:
     """The runs that options describe, or an `InputError`: what can be wrong is found before hours of training."""
-    dataparser = parse_dataparser([options.parser], options.data)
+    try:
+        dataparser = parse_dataparser(shlex.split(options.parser or ""), options.data)
+        read_scene(replace(dataparser, data=options.data).setup())
+    except InputError as error:
+        if error.advice is None:
+            raise
+        advice = (
+            "leave --parser out, or name what reads it, with its options, as --parser='llff-data --eval-interval 4'"
+        )
+        raise InputError(error.fault, advice) from error
     if not options.style_images:
         raise InputError("There is no painting; name at least one with --style-images.")
     if options.jobs is not None and options.jobs < 1:
         raise InputError(f"--jobs is {options.jobs}; at least one run at a time is needed.")
     for painting in options.style_images:
         Painting.read(painting)
-    prepare_output(options.output_path, "The page", "index.html")
+    prepare_output(options.output_path, "The page", "index.html", force=True)
     named = ("draft", "max_image_side", "coarse_iterations", "style_iterations")
     flags = {name: tuple(shlex.split(getattr(options, name))) for name in ("coarse_flags", "style_flags")}
     study = Study(options.data, dataparser, **{name: getattr(options, name) for name in named}, **flags)
@@ -301,4 +311,5 @@ def _write_page(title: str, options: StudyOptions, runs: PaperRuns, sections: Se
         for table in section.tables:
             table.print()
     page = study_page(f"{title}: {runs.study.name}", sections)
+    keep_former(options.output_path, page)
     return write_output(options.output_path, page, "The page", "index.html")

@@ -22,7 +22,6 @@ from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipe
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.pipelines.scene_views import SceneViews
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
-from sparsestyle_ns.runs.scene_record import record_scene
 from sparsestyle_ns.studies.curves import Curve, root_mean_square
 from sparsestyle_ns.studies.study import Study, flag_of, get_setting, with_setting
 from sparsestyle_ns.studies.study_options import Group
@@ -102,7 +101,7 @@ class Workbench:
 
     def _adopt_coarse_run(self, folder: Path) -> None:
         run = read_coarse_run(folder)
-        check_scene(run, record_scene(self.study.data, self.manager.train_dataparser_outputs, self.effects))
+        check_scene(run, self.manager.record(self.effects))
         config = with_setting(self.coarse_config, "pipeline.model", run.config.pipeline.model)
         model = self._setup_pipeline(config).model
         model.load_state_dict(run.model_state())

@@ -43,6 +43,8 @@ def error_text(error: Exception) -> str:
 
 def in_one_line(error: Exception) -> str:
     """An error's message without line breaks, or its kind where it has none."""
+    if isinstance(error, InputError):
+        return f"{error.fault}."  # what is kept apart from it is advice to one who types commands
     return " ".join(str(error).split()) or type(error).__name__
 
 
