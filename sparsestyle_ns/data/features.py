@@ -4,7 +4,7 @@ The package's one matcher: poses are found, photos judged and depths triangulate
 """
 
 from dataclasses import dataclass
-from typing import Dict, Iterable, List, Optional, Sequence, Set, Tuple
+from typing import Any, Callable, Dict, Iterable, List, Optional, Sequence, Set, Tuple, TypeVar, Union
 
 import cv2
 import numpy as np
@@ -17,6 +17,8 @@ GUIDED_DISTANCE = 0.7
 
 Pair = Tuple[int, int]
 """Numbers of two photos, the smaller first."""
+
+T = TypeVar("T")
 
 
 @dataclass
@@ -58,6 +60,17 @@ def match_photos(features: Sequence[Features], pairs: Iterable[Pair]) -> PhotoMa
     """Matches the features of these pairs of photos."""
     found = {pair: np.stack(mutual_matches(*(features[index].descriptors for index in pair))) for pair in pairs}
     return PhotoMatches([photo.points for photo in features], found)
+
+
+def estimated(estimator: Callable[..., T], *matches: Any, **settings: Any) -> Union[T, Tuple[None, None]]:
+    """What an estimator of OpenCV's finds: a model, and which matches agree with it; None and None where it gives up.
+
+    It gives up on degenerate matches, such as many of one point, in an assertion of its own.
+    """
+    try:
+        return estimator(*matches, **settings)
+    except cv2.error:
+        return None, None
 
 
 def linked_groups(count: int, links: Iterable[Pair]) -> List[Set[int]]:

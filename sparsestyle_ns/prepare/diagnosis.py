@@ -19,6 +19,7 @@ from sparsestyle_ns.data.features import (
     Features,
     Pair,
     PhotoMatches,
+    estimated,
     find_features,
     guided_matches,
     linked_groups,
@@ -160,11 +161,12 @@ def compare_photos(first: Features, second: Features, shape: Sequence[int]) -> L
     if len(start) < MIN_MATCHES:
         return Link(0, matched=matched)
     cv2.setRNGSeed(0)  # the same photos get the same verdict
-    matrix, inliers = cv2.findFundamentalMat(start, end, cv2.USAC_MAGSAC, EPIPOLAR_ERROR, 0.999, 10_000)
+    matrix, inliers = estimated(cv2.findFundamentalMat, start, end, cv2.USAC_MAGSAC, EPIPOLAR_ERROR, 0.999, 10_000)
     if matrix is None or matrix.shape != (3, 3) or inliers.sum() < MIN_MATCHES:
         return Link(0 if inliers is None else int(inliers.sum()), matched=matched)
     agree = inliers.ravel() > 0
-    warp, explained = cv2.findHomography(start[agree], end[agree], cv2.USAC_MAGSAC, FLAT_ERROR, maxIters=5_000)
+    points = start[agree], end[agree]
+    warp, explained = estimated(cv2.findHomography, *points, cv2.USAC_MAGSAC, FLAT_ERROR, maxIters=5_000)
     flat = 0.0 if explained is None else float(explained.mean())
     homogeneous = np.linalg.svd(matrix)[2][-1]
     middle = 0.5 * np.array([shape[1], shape[0]])
