@@ -182,24 +182,38 @@ class SecondDevice:
             self._state.within, self._state.moving = before
 
     @property
+    def in_backward(self) -> bool:
+        """Whether autograd works on the second device."""
+        return getattr(self._state, "in_backward", False)
+
+    @contextlib.contextmanager
+    def backward(self, on_second: bool) -> Iterator[None]:
+        """While autograd works."""
+        before, self._state.in_backward = self.in_backward, on_second
+        try:
+            yield
+        finally:
+            self._state.in_backward = before
+
+    @property
     def moving(self) -> bool:
         """Whether a tensor is being moved between the devices."""
         return getattr(self._state, "moving", False)
 
 
 def place() -> str:
-    """The innermost line that is the package's, or nerfstudio's, or a test's."""
-    frame, found = sys._getframe(1), []
+    """The innermost line of the package or of nerfstudio, and where there is none, of a test."""
+    frame, of_test = sys._getframe(1), "torch"
     while frame is not None:
         path = Path(frame.f_code.co_filename)
         for package in PACKAGES:
-            if package in path.parts[:-1] and "site-packages" not in path.parts[path.parts.index(package) :]:
-                inside = Path(*path.parts[path.parts.index(package) + (package == PACKAGES[0]) :])
-                found.append((PACKAGES.index(package), f"{inside}:{frame.f_lineno} {frame.f_code.co_name}"))
-        if path.name.startswith("test_"):
-            found.append((len(PACKAGES), f"{path.name}:{frame.f_lineno}"))
+            if package in path.parts[:-1]:
+                inside = Path(*path.parts[len(path.parts) - 1 - path.parts[::-1].index(package) :])
+                return f"{inside}:{frame.f_lineno} {frame.f_code.co_name}"
+        if path.name.startswith("test_") and of_test == "torch":
+            of_test = f"{path.name}:{frame.f_lineno}"
         frame = frame.f_back
-    return min(found, key=lambda each: each[0])[1] if found else "torch"
+    return of_test
 
 
 # ----------------------------------------------------------------------------------------------------------- operators
@@ -273,7 +287,10 @@ def _where(func: Any, inputs: List[Tensor], marked: List[bool], device: SecondDe
     """Whether an operator's results are on the second device."""
     if device.moving:
         return False
-    return any(marked) if inputs and not all(each.is_meta for each in inputs) else bool(device.within)
+    if inputs and not all(each.is_meta for each in inputs):
+        return any(marked)
+    # What no function of Python's asked for is made by autograd, beside the gradients that it has.
+    return device.in_backward if device.within is None else device.within
 
 
 def _written(func: Any, args: Tuple, kwargs: Dict) -> List[Tensor]:
@@ -312,8 +329,10 @@ class _Functions(TorchFunctionMode):
         within = any(map(device.marks, inputs)) if target is None else target
         _check_generator(device, func, within, kwargs.get("generator"))
         moves = func is Tensor.to and target is not None and target != device.marks(inputs[0])
-        if moves:
-            device.wait("copy from the cpu" if target else "copy to the cpu", inputs[0].nbytes if target else 0)
+        if moves and target:  # from memory that isn't pinned a copy waits for what was asked before, unless told not to
+            device.wait("copy on the way" if kwargs.get("non_blocking") else "copy from the cpu", inputs[0].nbytes)
+        elif moves:
+            device.wait("copy to the cpu")
         with device.function(within, moving=moves):
             result = func(*args, **kwargs)
         if within and func in (torch.tensor, torch.as_tensor, Tensor.new_tensor):
@@ -440,11 +459,16 @@ def _patches(device: SecondDevice) -> List[Any]:
     from torch.utils import _foreach_utils
 
     group, run = _foreach_utils._group_tensors_by_device_and_dtype, threading.Thread.run
+    engine = torch.autograd._engine_run_backward
 
     def grouped(lists: List[List[Optional[Tensor]]], *args: Any) -> Dict:
         found = group(lists, *args)
         first = {key: next(each for each in parts[0][0] if each is not None) for key, parts in found.items()}
         return {(first[key].device, key[1]): parts for key, parts in found.items()}
+
+    def run_backward(outputs: Any, *args: Any, **kwargs: Any) -> Any:
+        with device.backward(any(map(device.marks, _tensors(outputs)))):
+            return engine(outputs, *args, **kwargs)
 
     def run_within(thread: threading.Thread) -> None:
         with device.modes():
@@ -473,6 +497,7 @@ def _patches(device: SecondDevice) -> List[Any]:
         mock.patch.object(torch, "autocast", _Autocast),
         mock.patch.object(threading.Thread, "run", run_within),
         mock.patch.object(torch.autograd, "has_torch_function", lambda _: False),
+        mock.patch.object(torch.autograd, "_engine_run_backward", run_backward),
         mock.patch.object(_foreach_utils, "_group_tensors_by_device_and_dtype", grouped),
         mock.patch.object(sys.modules[torch.optim.Optimizer.__module__], "_group_tensors_by_device_and_dtype", grouped),
         mock.patch.object(sys.modules["torch.nn.utils.clip_grad"], "_group_tensors_by_device_and_dtype", grouped),
