@@ -142,8 +142,6 @@ def find_or_train_coarse(scene: Scene, options: Options) -> CoarseRun:
         print(f"Training a coarse run of {iterations} iterations, once; it is kept in {folder}", flush=True)
         command = ["-m", "nerfstudio.scripts.train", COARSE_METHOD, "--data", scene.folder, "--output-dir", folder]
         command += ["--max-num-iterations", iterations]
-        for group in ("fields", "hidden_layers"):
-            command += [f"--optimizers.{group}.scheduler.max-steps", iterations]
         command += ["--machine.device-type", device, "--vis", "tensorboard", "--viewer.quit-on-train-completion"]
         command += ["True", *(QUICK_COARSE if options.quick else [])]
         command += ["llff-data"]

@@ -100,7 +100,7 @@ def test_variants_named_after_the_paper_have_its_settings() -> None:
     assert (field.num_levels, field.num_layers) == (7, 6)
     optimizer, scheduler = (style.optimizers["fields"][part] for part in ("optimizer", "scheduler"))
     assert (optimizer.lr, optimizer.betas) == (5e-3, (0.9, 0.999))
-    assert (scheduler.gamma, scheduler.milestones) == (0.33, (50, 100))
+    assert (scheduler.gamma, scheduler.milestones, scheduler.warm_up) == (0.33, (0.25, 0.5), 0.0)
     settings, model = style.pipeline, style.pipeline.model
     (level,) = settings.levels(style.max_num_iterations)
     assert (level.scale, level.length) == (1.0, 200)

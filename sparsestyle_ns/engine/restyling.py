@@ -18,6 +18,7 @@ import yaml
 from torch import Tensor, nn
 
 from sparsestyle_ns.effects.registry import decide_again
+from sparsestyle_ns.engine.schedules import over_iterations
 from sparsestyle_ns.engine.style_trainer import style_notes
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.engine.training import check_skipped, training_step, warm_start
@@ -90,7 +91,8 @@ class Restyling:
             raise InputError(f"A style needs at least 1 iteration, and {self.iterations} were asked for.")
         self._painting = Path(PAINTING_FOLDER) / safe_file_name(self.image.name, "painting")
         self.field = workshop.new_field()
-        self.optimizers = FiniteOptimizers(self.config.optimizers.copy(), {"fields": list(self.field.parameters())})
+        optimizers = over_iterations(self.config.optimizers, self.iterations)
+        self.optimizers = FiniteOptimizers(optimizers, {"fields": list(self.field.parameters())})
 
     def __iter__(self) -> Iterator[Progress]:
         yield Progress(f"Looking at {self.image.name}")

@@ -22,6 +22,7 @@ from torch import Tensor
 from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.engine.hints import finish, ns_train_style, resume_command
 from sparsestyle_ns.engine.previews import preview_steps, write_preview
+from sparsestyle_ns.engine.schedules import over_iterations
 from sparsestyle_ns.engine.training import check_skipped, training_step
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
@@ -110,7 +111,8 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def setup_optimizers(self) -> FiniteOptimizers:
         """Optimisers that skip steps whose gradient isn't finite."""
-        return FiniteOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
+        optimizers = over_iterations(self.config.optimizers, self.config.max_num_iterations)
+        return FiniteOptimizers(optimizers, self.pipeline.get_param_groups())
 
     def _save_decisions(self) -> None:
         self.pipeline.effects.save(self.base_dir)
