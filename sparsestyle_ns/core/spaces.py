@@ -116,7 +116,7 @@ class ContractedSegments(Segments):
         return inverse_spacing(start + s * (end - start))
 
     def _ends(self, like: Tensor) -> Tuple[Tensor, Tensor]:
-        return spacing(like.new_tensor(self.near)), spacing(like.new_tensor(MAX_DISTANCE))
+        return spacing(like.new_full((), self.near)), spacing(like.new_full((), MAX_DISTANCE))
 
     def at_distance(self, distance: Tensor) -> Tensor:
         """See `Segments.at_distance`."""

@@ -91,14 +91,16 @@ class StyleIndex:
         finer_bounds, _ = _block_maxima(fine, self.fine, blocks, rows)
         best_bounds = finer_bounds.new_full((len(directions),), -torch.inf)
         is_favorite = finer_bounds == best_bounds.scatter_reduce_(0, rows, finer_bounds, "amax")[rows]
-        compare(blocks[is_favorite], rows[is_favorite])
-        is_left = ~is_favorite & (finer_bounds >= best[rows])
-        compare(blocks[is_left], rows[is_left])
+        # A GPU is waited for wherever the number of pairs that are left must be known: seven times in a search. Comparing
+        # everything with everything would wait for nothing, but do ten times the work.
+        pairs = is_favorite.nonzero().squeeze(-1)
+        compare(blocks[pairs], rows[pairs])
+        pairs = (~is_favorite & (finer_bounds >= best[rows])).nonzero().squeeze(-1)
+        compare(blocks[pairs], rows[pairs])
 
         rows, values, found = (torch.cat(parts) for parts in zip(*compared, strict=True))
-        is_best = values == best[rows]
-        nearest = rows.new_zeros(len(best))
-        return nearest.scatter_reduce_(0, rows[is_best], found[is_best], "amin", include_self=False)
+        found = torch.where(values == best[rows], found, len(self._places) - 1)
+        return rows.new_zeros(len(best)).scatter_reduce_(0, rows, found, "amin", include_self=False)
 
     def _bounds(self, outlines: Float[Tensor, "n k"]) -> Float[Tensor, "blocks n"]:
         """Bounds of the similarities between each feature vector and any style vector of each block."""
@@ -181,7 +183,8 @@ def _block_maxima(
     rows: Int[Tensor, " P"],
 ) -> Tuple[Float[Tensor, " P"], Int[Tensor, " P"]]:
     """The largest product of a vector with those of a block, and its first place there, for pairs sorted by block."""
-    counts = torch.bincount(blocks, minlength=len(style_blocks)).tolist()
+    ends = torch.searchsorted(blocks, torch.arange(len(style_blocks), device=blocks.device), right=True)
+    counts = torch.diff(ends, prepend=ends.new_zeros(1)).tolist()
     maxima = [
         (vectors[members] @ block.T).max(dim=1) for block, members in zip(style_blocks, rows.split(counts), strict=True)
     ]

@@ -1,6 +1,6 @@
 """Optimisers that leave everything as it is where a gradient isn't finite."""
 
-from typing import Any, Dict, Iterable, List, Tuple
+from typing import Any, Callable, Dict, Iterable, List, Optional, Tuple
 
 import torch
 from jaxtyping import Float
@@ -26,6 +26,34 @@ def step_if_finite(optimizer: Optimizer, is_broken: Float[Tensor, ""]) -> bool:
         optimizer.found_inf = is_broken
         return True
     return not is_broken.item()
+
+
+class FiniteMuon(torch.optim.Muon):
+    """torch's Muon, which leaves everything as it is where `found_inf` is 1, and for which nothing waits.
+
+    The two attributes are those by which fused optimisers are told; `grad_scale` is a scaler's.
+    """
+
+    _step_supports_amp_scaling = True
+    found_inf: Optional[Float[Tensor, ""]] = None
+    grad_scale: Optional[Float[Tensor, ""]] = None
+
+    @torch.no_grad()
+    def step(self, closure: Optional[Callable[[], float]] = None) -> Optional[float]:
+        """A step; what it would change is kept beside it, and put back on the device if need be."""
+        parameters = [each for group in self.param_groups for each in group["params"] if each.grad is not None]
+        changed = list(parameters)
+        for parameter in parameters:
+            state = self.state[parameter]
+            state.setdefault("momentum_buffer", torch.zeros_like(parameter.grad))
+            changed.append(state["momentum_buffer"])
+            if self.grad_scale is not None:
+                parameter.grad /= self.grad_scale
+        before = [] if self.found_inf is None else [tensor.clone() for tensor in changed]
+        loss = super().step(closure)
+        for tensor, value in zip(changed, before, strict=False):
+            tensor.copy_(torch.where(self.found_inf > 0, value, tensor))
+        return loss
 
 
 class FiniteOptimizers(Optimizers):

@@ -167,7 +167,9 @@ def test_weights_are_shares_of_the_light(data, num_rays, samples, dtype):
     assert gradient.isfinite().all()
 
 
-@covers(compositing.packed_transmittance, compositing.packed_weights, compositing.packed_sum)
+@covers(
+    compositing.packed_transmittance, compositing.packed_weights, compositing.packed_sum, compositing.ray_borders
+)
 @given(st.data(), st.integers(0, 60), ALL_FLOATS)
 def test_packed_samples_are_the_dense_ones_of_each_ray(data, samples, dtype):
     ray_indices, num_rays = packed_indices(data.draw, samples)
@@ -175,6 +177,7 @@ def test_packed_samples_are_the_dense_ones_of_each_ray(data, samples, dtype):
     light = compositing.packed_transmittance(depth, ray_indices, num_rays)
     weights = compositing.packed_weights(depth, ray_indices, num_rays)
     counts = torch.bincount(ray_indices, minlength=num_rays).tolist()
+    assert compositing.ray_borders(ray_indices, num_rays).diff().tolist() == counts
     expected = torch.cat([compositing.dense_weights(ray) for ray in depth.split(counts)])
     torch.testing.assert_close(weights, expected, rtol=1e-4, atol=1e-7)
     assert (light >= 0).all() and (light <= 1 + 1e-6).all()
