@@ -81,4 +81,5 @@ def test_print(device, llff_scene, painting, coarse_state):
     b = Counter(waits_of(device, Training(c, CUDA, coarse_state), 4))
     for w in (a, b):
         print("TOTAL", sum(n for k, n in w.items() if k.kind != "copy on the way") / 4)
-        for k, n in sorted(w.items(), key=lambda i: -i[1]): print(n / 4, *k)
+        for k, n in sorted(w.items(), key=lambda i: -i[1]):
+            print(n / 4, *k)

@@ -40,18 +40,21 @@ class FiniteMuon(torch.optim.Muon):
 
     @torch.no_grad()
     def step(self, closure: Optional[Callable[[], float]] = None) -> Optional[float]:
-        """A step; what it would change is kept beside it, and put back on the device if need be."""
+        """A step; on a GPU, what it changes is kept beside it and put back there if need be."""
         parameters = [each for group in self.param_groups for each in group["params"] if each.grad is not None]
-        changed = list(parameters)
-        for parameter in parameters:
-            state = self.state[parameter]
-            state.setdefault("momentum_buffer", torch.zeros_like(parameter.grad))
-            changed.append(state["momentum_buffer"])
-            if self.grad_scale is not None:
+        if self.grad_scale is not None:
+            for parameter in parameters:
                 parameter.grad /= self.grad_scale
-        before = [] if self.found_inf is None else [tensor.clone() for tensor in changed]
+        if self.found_inf is None:
+            return super().step(closure)
+        if self.found_inf.device.type == "cpu":  # a look costs nothing there, and copies would cost time
+            return None if self.found_inf.item() else super().step(closure)
+        for parameter in parameters:
+            self.state[parameter].setdefault("momentum_buffer", torch.zeros_like(parameter.grad))
+        changed = [*parameters, *(self.state[parameter]["momentum_buffer"] for parameter in parameters)]
+        before = [tensor.clone() for tensor in changed]
         loss = super().step(closure)
-        for tensor, value in zip(changed, before, strict=False):
+        for tensor, value in zip(changed, before, strict=True):
             tensor.copy_(torch.where(self.found_inf > 0, value, tensor))
         return loss
 

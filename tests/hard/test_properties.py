@@ -167,9 +167,7 @@ def test_weights_are_shares_of_the_light(data, num_rays, samples, dtype):
     assert gradient.isfinite().all()
 
 
-@covers(
-    compositing.packed_transmittance, compositing.packed_weights, compositing.packed_sum, compositing.ray_borders
-)
+@covers(compositing.packed_transmittance, compositing.packed_weights, compositing.packed_sum, compositing.ray_borders)
 @given(st.data(), st.integers(0, 60), ALL_FLOATS)
 def test_packed_samples_are_the_dense_ones_of_each_ray(data, samples, dtype):
     ray_indices, num_rays = packed_indices(data.draw, samples)
