@@ -423,7 +423,7 @@ SPECIAL: Dict[Any, Callable] = {
 """What is done instead of a function or a property's getter."""
 
 
-# -------------------------------------------------------------------------------------- what isn't a function of tensors
+# ------------------------------------------------------------------------------------- what isn't a function of tensors
 
 
 class _Generator(torch._C.Generator):
@@ -457,6 +457,7 @@ class _Autocast(torch.autocast):
 
 def _patches(device: SecondDevice) -> List[Any]:
     from torch.utils import _foreach_utils
+    from torch.utils import checkpoint as checkpointing
 
     group, run = _foreach_utils._group_tensors_by_device_and_dtype, threading.Thread.run
     engine = torch.autograd._engine_run_backward
@@ -465,6 +466,9 @@ def _patches(device: SecondDevice) -> List[Any]:
         found = group(lists, *args)
         first = {key: next(each for each in parts[0][0] if each is not None) for key, parts in found.items()}
         return {(first[key].device, key[1]): parts for key, parts in found.items()}
+
+    def described(tensor: Tensor) -> Dict[str, Any]:
+        return {"shape": tensor.shape, "dtype": tensor.dtype, "device": device.marks(tensor)}
 
     def run_backward(outputs: Any, *args: Any, **kwargs: Any) -> Any:
         with device.backward(any(map(device.marks, _tensors(outputs)))):
@@ -496,6 +500,8 @@ def _patches(device: SecondDevice) -> List[Any]:
         mock.patch.object(torch, "Generator", _Generator),
         mock.patch.object(torch, "autocast", _Autocast),
         mock.patch.object(threading.Thread, "run", run_within),
+        # Checkpointing compares what is saved, once beneath the modes and once above.
+        mock.patch.dict(checkpointing._allowed_determinism_checks_to_fns, default=described),
         mock.patch.object(torch.autograd, "has_torch_function", lambda _: False),
         mock.patch.object(torch.autograd, "_engine_run_backward", run_backward),
         mock.patch.object(_foreach_utils, "_group_tensors_by_device_and_dtype", grouped),

@@ -1,16 +1,19 @@
 """Both methods on a second device (`second_device.py`): nothing is left on the CPU, and little is waited for."""
 
 import copy
+from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, Callable, Counter, Iterator
+from typing import Any, Dict, Iterator
 
 import pytest
 import torch
+from conftest import TINY, TINY_STYLE, ns_train, only_run
+from interpreted_kernels import interpreted_kernels
 from second_device import CUDA, SecondDevice
 
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.decisions import EffectSettings
+from sparsestyle_ns.engine.previews import render_preview
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.field_components import hash_grid
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
@@ -30,56 +33,107 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[SecondDevice]:
     assert second.mistakes == []
 
 
-def coarse_config(scene: Path, **effects: str) -> Any:
-    config = copy.deepcopy(method_config("coarse-fewshot"))
+def set_up(config: Any, scene: Path, effects: Dict[str, str], **settings: Any) -> Any:
+    """A small version of a method, with some settings of its pipeline; those of its model have names with a dot."""
+    config = copy.deepcopy(config)
     config.max_num_iterations = 8
     pipeline = config.pipeline
     pipeline.datamanager.data, pipeline.datamanager.dataparser = scene, LLFFDataParserConfig()
     pipeline.datamanager.train_num_rays_per_batch = 64
     pipeline.effects = EffectSettings(**{**EFFECTS, **effects})
-    pipeline.model.coarse_field = FIELD
-    pipeline.model.volume_resolution = pipeline.model.grid_resolution = 8
+    pipeline.backbone, pipeline.model.coarse_field = "vgg16-shift-tolerant", FIELD
+    for name, value in settings.items():
+        owner, _, last = name.rpartition("__")
+        assert hasattr(getattr(pipeline, owner) if owner else pipeline, last)
+        setattr(getattr(pipeline, owner) if owner else pipeline, last, value)
     return config
 
 
-def style_config(scene: Path, painting: Path, **effects: str) -> Any:
-    config = copy.deepcopy(method_config("hier-style"))
-    config.max_num_iterations = 8
-    pipeline = config.pipeline
-    pipeline.datamanager.data, pipeline.datamanager.dataparser = scene, LLFFDataParserConfig()
-    pipeline.effects = EffectSettings(**{**EFFECTS, **effects})
-    pipeline.style_image, pipeline.backbone, pipeline.warm_start_steps = painting, "vgg16-shift-tolerant", 1
-    pipeline.model.coarse_field, pipeline.model.log2_table_size = FIELD, 8
-    pipeline.model.hash_levels, pipeline.model.layer_width = 2, 16
-    pipeline.model.occupancy_resolution, pipeline.model.bake_resolution = 16, 16
-    return config
+def coarse_config(scene: Path, effects: Dict[str, str] = {}, **settings: Any) -> Any:  # noqa: B006 - only read
+    sizes = {"model__volume_resolution": 8, "model__grid_resolution": 8}
+    return set_up(method_config("coarse-fewshot"), scene, effects, **sizes, **settings)
 
 
-@pytest.fixture(scope="session")
-def coarse_state(llff_scene: Path) -> dict:
-    """Of a coarse field that shows something, on the CPU."""
+def style_config(scene: Path, painting: Path, effects: Dict[str, str] = {}, **settings: Any) -> Any:  # noqa: B006
+    sizes = {"log2_table_size": 8, "hash_levels": 2, "layer_width": 16, "occupancy_resolution": 8, "bake_resolution": 16}
+    sizes = {f"model__{name}": value for name, value in sizes.items()}
+    run = {"style_image": painting, "warm_start_steps": 1, "feature_side": 32}
+    return set_up(method_config("hier-style"), scene, effects, **sizes, **{**run, **settings})
+
+
+def coarse_state(scene: Path, effects: Dict[str, str]) -> Dict[str, torch.Tensor]:
+    """Of a coarse field that shows something."""
     torch.manual_seed(0)
-    model = Training(coarse_config(llff_scene), torch.device("cpu")).pipeline.model
+    model = Training(coarse_config(scene, effects), CUDA).pipeline.model
     with torch.no_grad():
         model.field.density_head.weight.normal_(std=2.0)
     return model.state_dict()
 
 
-def waits_of(device: SecondDevice, training: Training, steps: int) -> Counter:
-    """What iterations wait for, after a first one."""
-    training.step()
-    device.waits.clear()
-    for _ in range(steps):
+def look(training: Training) -> None:
+    """Renders a held-out view and measures it, as previews, `ns-eval` and tensorboard do."""
+    pipeline = training.pipeline
+    render_preview(pipeline, 16)
+    pipeline.get_eval_loss_dict(0)
+    pipeline.get_eval_image_metrics_and_images(0)
+
+
+OUTSIDE = {"ndc": "off", "contraction": "on"}
+
+
+@pytest.mark.parametrize(
+    "effects, settings",
+    [
+        ({}, {}),
+        ({**OUTSIDE, "background": "on", "exposure": "on"}, {"model__thinning": 0.0}),
+        ({"matched_depth": "on", "empty_space": "off", "view_color": "on"}, {"model__occlusion_weight": 0.1}),
+        ({"empty_space": "auto"}, {"semantic_weight": 0.1, "semantic_every": 2, "model__frequency_reveal": 0.9}),
+    ],
+)
+def test_stage_1_trains_there(device: SecondDevice, llff_scene: Path, effects: dict, settings: dict) -> None:
+    training = Training(coarse_config(llff_scene, effects, **settings), CUDA)
+    for _ in range(7):  # past three quarters, where it is decided about empty space
         training.step()
-    return device.waits
+    look(training)
+    training.pipeline.model.finish_learning()
+    look(training)
+    held = {name: str(value.device) for name, value in training.pipeline.state_dict().items()}
+    assert set(held.values()) == {"cuda:0"}, held
 
 
-def test_print(device, llff_scene, painting, coarse_state):
-    a = Counter(waits_of(device, Training(coarse_config(llff_scene), CUDA), 4))
-    c = style_config(llff_scene, painting)
-    c.pipeline.cache_gigabytes = 0.0
-    b = Counter(waits_of(device, Training(c, CUDA, coarse_state), 4))
-    for w in (a, b):
-        print("TOTAL", sum(n for k, n in w.items() if k.kind != "copy on the way") / 4)
-        for k, n in sorted(w.items(), key=lambda i: -i[1]):
-            print(n / 4, *k)
+@pytest.mark.parametrize(
+    "effects, settings",
+    [
+        ({}, {}),
+        ({**OUTSIDE, "background": "on", "exposure": "on", "palette": "on"}, {"cache_gigabytes": 0.0}),
+        ({"empty_space": "off", "palette": "on"}, {"novel_views": 2, "samples_per_chunk": 512}),
+        ({"view_color": "on"}, {"model__stylised_field": "coarse"}),
+        ({"residual_density": "off"}, {"model__num_samples": None, "model__fine_encoding": "frequency"}),
+        ({}, {"model__fine_encoding": "none", "style_features": 50}),
+    ],
+)
+def test_stage_2_trains_and_renders_there(
+    device: SecondDevice, llff_scene: Path, painting: Path, effects: dict, settings: dict
+) -> None:
+    config = style_config(llff_scene, painting, effects, **settings)
+    training = Training(config, CUDA, coarse_state(llff_scene, effects))
+    for _ in range(3):
+        training.num_steps = (training.num_steps + 3) % 8  # at both sizes of the views
+        training.step()
+    look(training)
+    with training.pipeline.model.display.rendering("baked"):
+        look(training)
+    held = {name: str(value.device) for name, value in training.pipeline.state_dict().items()}
+    assert set(held.values()) == {"cuda:0"}, held
+
+
+def test_the_grids_kernels_for_cuda_train_there(llff_scene: Path, painting: Path, monkeypatch) -> None:
+    kernels, interpreted = hash_grid.fused_kernels, interpreted_kernels()
+    monkeypatch.setattr(hash_grid, "fused_kernels", lambda on: interpreted if on.type == "cuda" else kernels(on))
+    with SecondDevice() as device:
+        settings = {"warm_start_steps": 0, "view_scales": (0.5,), "scale_shares": (1.0,)}
+        config = style_config(llff_scene, painting, **settings)
+        training = Training(config, CUDA, coarse_state(llff_scene, {}))
+        training.step()
+        assert training.pipeline.model.residual.grid.table.grad.count_nonzero() > 0
+    assert device.mistakes == []

@@ -18,7 +18,7 @@ def device():
 
 
 def there(*shape):
-    return torch.rand(*shape, device="cuda")
+    return torch.rand(shape, device="cuda")
 
 
 def test_what_is_made_there_stays_there_through_views_gradients_and_optimisers(device):

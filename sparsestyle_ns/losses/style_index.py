@@ -91,8 +91,8 @@ class StyleIndex:
         finer_bounds, _ = _block_maxima(fine, self.fine, blocks, rows)
         best_bounds = finer_bounds.new_full((len(directions),), -torch.inf)
         is_favorite = finer_bounds == best_bounds.scatter_reduce_(0, rows, finer_bounds, "amax")[rows]
-        # A GPU is waited for wherever the number of pairs that are left must be known: seven times in a search. Comparing
-        # everything with everything would wait for nothing, but do ten times the work.
+        # A GPU is waited for wherever the number of pairs that are left must be known, seven times in a search. Comparing
+        # all with all would wait for nothing, but do ten times the work.
         pairs = is_favorite.nonzero().squeeze(-1)
         compare(blocks[pairs], rows[pairs])
         pairs = (~is_favorite & (finer_bounds >= best[rows])).nonzero().squeeze(-1)
