@@ -7,17 +7,21 @@ from typing import Any, Dict, Iterator
 
 import pytest
 import torch
-from conftest import TINY, TINY_STYLE, ns_train, only_run
+from conftest import TINY, TINY_STYLE, ns_train, only_run, run_entrypoint
 from interpreted_kernels import interpreted_kernels
 from second_device import CUDA, SecondDevice
+from test_commands import render
 
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.decisions import EffectSettings
+from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.engine.previews import render_preview
+from sparsestyle_ns.engine.restyling import Restyling, Workshop
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.field_components import hash_grid
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.style.painting import Painting
 
 FIELD = CoarseFieldConfig(num_levels=3, num_layers=2, layer_width=16, feature_dim=4)
 EFFECTS = {"empty_space": "on", "residual_density": "on", "matched_depth": "off", "exposure": "off"}
@@ -50,12 +54,19 @@ def set_up(config: Any, scene: Path, effects: Dict[str, str], **settings: Any) -
 
 
 def coarse_config(scene: Path, effects: Dict[str, str] = {}, **settings: Any) -> Any:  # noqa: B006 - only read
-    sizes = {"model__volume_resolution": 8, "model__grid_resolution": 8}
+    sizes = {"model__volume_resolution": 8, "model__grid_resolution": 8, "model__num_steps": 12}
     return set_up(method_config("coarse-fewshot"), scene, effects, **sizes, **settings)
 
 
 def style_config(scene: Path, painting: Path, effects: Dict[str, str] = {}, **settings: Any) -> Any:  # noqa: B006
-    sizes = {"log2_table_size": 8, "hash_levels": 2, "layer_width": 16, "occupancy_resolution": 8, "bake_resolution": 16}
+    sizes = {
+        "log2_table_size": 8,
+        "hash_levels": 2,
+        "layer_width": 16,
+        "occupancy_resolution": 8,
+        "bake_resolution": 16,
+    }
+    sizes["num_steps"] = 12
     sizes = {f"model__{name}": value for name, value in sizes.items()}
     run = {"style_image": painting, "warm_start_steps": 1, "feature_side": 32}
     return set_up(method_config("hier-style"), scene, effects, **sizes, **{**run, **settings})
@@ -137,3 +148,31 @@ def test_the_grids_kernels_for_cuda_train_there(llff_scene: Path, painting: Path
         training.step()
         assert training.pipeline.model.residual.grid.table.grad.count_nonzero() > 0
     assert device.mistakes == []
+
+
+@pytest.mark.slow
+def test_all_commands_run_there(device: SecondDevice, llff_scene: Path, painting: Path, tmp_path: Path) -> None:
+    from sparsestyle_ns.cli import main
+
+    def sparsestyle(*words: Any) -> None:
+        run_entrypoint(main, [*map(str, words)])
+
+    ns_train("coarse-fewshot", llff_scene, tmp_path, "--max-num-iterations", "3", *TINY)
+    style = ["--style-image", str(painting), *TINY_STYLE, "--pipeline.effects.residual-density", "on"]
+    ns_train("hier-style", llff_scene, tmp_path, "--max-num-iterations", "3", *style)
+    run = only_run(tmp_path, "hier-style")
+    for method, flags in (("coarse-fewshot", TINY), ("hier-style", style)):
+        resumed = ["--load-dir", str(only_run(tmp_path, method) / "nerfstudio_models"), "--max-num-iterations", "5"]
+        ns_train(method, llff_scene, tmp_path / "resumed", *resumed, *flags)
+    sparsestyle("evaluate", only_run(tmp_path, "coarse-fewshot"))
+    sparsestyle("evaluate", run, "--baked", "--output-path", tmp_path / "report.json")
+    sparsestyle("export", run, "--format", "html", "--output-path", tmp_path / "page.html", "--resolution", "16")
+    sparsestyle("export", run, "--format", "ply", "--output-path", tmp_path / "points.ply")
+    sparsestyle("gallery", run, "--output-path", tmp_path / "gallery.html", "--frames", "2")
+    sparsestyle("effects", "--data", llff_scene)
+    render("interpolate", run, tmp_path / "between", "--output-format", "images", "--interpolation-steps", "2")
+    loaded = load_run(run / "config.yml")
+    assert loaded.pipeline.device == "cuda" or str(loaded.pipeline.device).startswith("cuda")
+    restyling = Restyling(Workshop(loaded.pipeline, run, nullcontext()), Painting.read(painting), iterations=1)
+    assert list(restyling)[-1].done == 1.0
+    restyling.save()

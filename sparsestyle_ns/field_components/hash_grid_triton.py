@@ -114,12 +114,16 @@ def scatter(
     return table_grad
 
 
+def _programs(num_points: int, levels: int) -> Tuple[int, int]:
+    """How many programs there are: blocks of points first, as CUDA allows 2³¹ − 1 there and 65,535 beside."""
+    return triton.cdiv(num_points, POINTS_PER_PROGRAM), levels
+
+
 def _launch(kernel, table, positions, resolutions, values, table_shape: Tuple[int, int, int]) -> None:
     levels, rows, features = table_shape
     if len(positions) == 0:
         return
-    grid = (triton.cdiv(len(positions), POINTS_PER_PROGRAM), levels)
-    kernel[grid](
+    kernel[_programs(len(positions), levels)](
         table,
         positions.contiguous(),
         numbers_on(resolutions, positions.device, positions.dtype),
