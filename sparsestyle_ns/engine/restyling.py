@@ -80,13 +80,17 @@ class Workshop:
 class Restyling:
     """One restyling, in steps: `for progress in restyling: …`, then `field` (σ_f and c_f) is the new style.
 
-    Without a number of iterations, as many as the run had; InputError for less than 1.
+    Without a number of iterations, as many as the run had, and without a size of strokes, the run's; InputError for
+    less than one iteration.
     """
 
-    def __init__(self, workshop: Workshop, image: Painting, iterations: Optional[int] = None) -> None:
+    def __init__(
+        self, workshop: Workshop, image: Painting, iterations: Optional[int] = None, stroke_size: Optional[float] = None
+    ) -> None:
         self.workshop, self.pipeline, self.image = workshop, workshop.pipeline, image
         self.config: SparseStyleTrainerConfig = read_config(workshop.folder)  # as it is by now
         self.iterations = self.config.max_num_iterations if iterations is None else iterations
+        self.stroke_size = self.config.pipeline.stroke_size if stroke_size is None else stroke_size
         if self.iterations < 1:
             raise InputError(f"A style needs at least 1 iteration, and {self.iterations} were asked for.")
         self._painting = Path(PAINTING_FOLDER) / safe_file_name(self.image.name, "painting")
@@ -101,7 +105,8 @@ class Restyling:
         self.effects = decide_again(pipeline.effects, "palette", scene)  # what depends on the painting
         if pipeline.scene_views is None:
             yield Progress("Preparing the views, which the next style won't need")
-        task = pipeline.new_task(self.field, self.image, self.workshop.backbone, self.effects, total)
+        of_style = self.field, self.image, self.workshop.backbone, self.effects
+        task = pipeline.new_task(*of_style, total, self.stroke_size)
         warm_up = pipeline.config.warm_start_steps
         for step in warm_start(pipeline, task, self.optimizers):
             yield Progress(f"Warm start, step {step + 1} of {warm_up}", (step + 1) / (warm_up + total))
@@ -140,6 +145,7 @@ class Restyling:
             config = copy.deepcopy(self.config)
             config.timestamp, config.max_num_iterations = folder.name, self.iterations
             config.load_dir = config.load_step = config.load_checkpoint = None
+            config.pipeline.stroke_size = self.stroke_size
             config.pipeline.style_image, config.pipeline.decided = folder.resolve() / self._painting, self.effects
             write_whole(new / "config.yml", yaml.dump(config))
             return new.rename(folder)

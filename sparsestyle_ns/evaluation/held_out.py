@@ -23,6 +23,7 @@ from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID
 from sparsestyle_ns.metrics.consistency import RANGES, PathGeometry
 from sparsestyle_ns.metrics.image import gram_distance, gram_matrix, image_metrics, psnr, structural_similarity
+from sparsestyle_ns.metrics.strokes import stroke_width
 from sparsestyle_ns.metrics.style_distance import StyleDistance
 from sparsestyle_ns.metrics.warping import MIN_COVERAGE, Pinhole, Surface
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
@@ -178,9 +179,9 @@ class StyleFigures:
         """How strong a view's style is, before (`…_before`) and after stylising, and how far its content has moved.
 
         `style_loss` and `content_loss` are Eq. 5's: nearest neighbour feature matching, and the features' distance from
-        the unstylised view; other losses of `targets` are `NAME_loss`, `gram_distance` is that of `metrics.image`, and
-        the rest are of `StyleDistance`. With `accumulation`, only where the scene covers the picture: a background
-        can't be stylised.
+        the unstylised view; other losses of `targets` are `NAME_loss`, `gram_distance` is that of `metrics.image`,
+        `stroke_width` that of `metrics.strokes` in pixels, and the rest are of `StyleDistance`. With `accumulation`,
+        only where the scene covers the picture: a background can't be stylised.
         """
         content, figures = self.targets.features(coarse), {}
         for suffix, picture in (("_before", coarse), ("", stylised)):
@@ -188,6 +189,7 @@ class StyleFigures:
             found = {f"{name}_loss": float(value) for name, value in self.targets.losses(view).items()}
             found["gram_distance"] = float(gram_distance(gram_matrix(view.features), self.gram))
             found |= self.distance.figures(picture, accumulation)
+            found["stroke_width"] = stroke_width(picture)
             figures |= {f"{name}{suffix}": value for name, value in found.items()}
         figures.pop("content_loss_before", None)
         return figures

@@ -158,10 +158,10 @@ def _views_table(views: Sequence[Dict[str, float]]) -> Table:
 def _settings(config: TrainerConfig, dataset: PhotoDataset, photo_side: int, step: int) -> List[Tuple[str, str]]:
     pipeline: HierStylePipelineConfig = config.pipeline
     height, width = int(dataset.cameras.height[0]), int(dataset.cameras.width[0])
-    side, weight = pipeline.feature_side or photo_side, pipeline.loss_weights["content"]
+    weight = pipeline.loss_weights["content"]
     sizes, weights = [], []
     for level in pipeline.levels(config.max_num_iterations):
-        sizes.append(f"{round(level.scale * side)} pixels in {level.length} iterations")
+        sizes.append(f"{pipeline.side_at(level.scale, photo_side)} pixels in {level.length} iterations")
         first, last = (
             pipeline.weights_at(at, level)["content"] if weight > 0 else 0.0
             for at in (level.first, level.first + level.length)

@@ -26,6 +26,9 @@ from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress import say
 
+STROKE_SIZES = (0.5, 2.0)
+"""The smallest and the largest."""
+
 
 @dataclass
 class HierStylePipelineConfig(CheckedPipelineConfig):
@@ -44,10 +47,12 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     counts, and iterations before it are quick."""
     scale_shares: Tuple[float, ...] = (0.85, 0.15)
     """Shares of the iterations at these sizes."""
+    stroke_size: Annotated[float, tyro.conf.arg(aliases=("--stroke-size",))] = 1.0
+    """How wide strokes are, from 0.5 to 2: the feature network sees views and painting in this many times smaller
+    pictures, where its patches are as many times wider. 0.5 takes four times the network's time and memory."""
     feature_side: Optional[int] = None
-    """Longer side, in pixels, at which the feature network sees rendered views of the photos' size. None: theirs."""
-    style_side: Optional[int] = None
-    """Longer side at which it sees the style image then: smaller gives finer strokes. None: as the views."""
+    """Longer side, in pixels, at which the network sees views of the photos' size where strokes are of size 1. None:
+    theirs."""
     style_features: Optional[int] = None
     """Match with at most so many of the painting's feature vectors, drawn at random; None: all of them."""
     loss_weights: Dict[str, float] = field(default_factory=default_weights)
@@ -76,6 +81,9 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         """The painting and the feature network, on the CPU; InputError where these or a setting can't be used."""
         if self.style_features is not None and self.style_features < 1:
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
+        smallest, largest = STROKE_SIZES
+        if not smallest <= self.stroke_size <= largest:
+            raise InputError(f"--stroke-size is {self.stroke_size:g}; give a number from {smallest:g} to {largest:g}.")
         for name, weight in self.loss_weights.items():
             if name not in LOSSES:
                 known = ", ".join(LOSSES)
@@ -94,6 +102,10 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
             raise InputError(f"--pipeline.content-restart is {self.content_restart}; give a number above 0.")
         return coarse_to_fine(self.view_scales, self.scale_shares, iterations)
 
+    def side_at(self, scale: float, photo_side: int) -> int:
+        """Longer side, in pixels, at which the network sees views at a scale of photos of a size, and the painting."""
+        return max(1, round(scale * (self.feature_side or photo_side) / self.stroke_size))
+
     def targets_of(
         self, painting: Painting, backbone: Backbone, device: torch.device, photo_side: int, scale: float = 1.0
     ) -> StyleTargets:
@@ -101,10 +113,9 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
 
         The network moves to the device.
         """
-        side = self.feature_side or photo_side
-        sides = (max(1, round(scale * each)) for each in (side, self.style_side or side))
+        side = self.side_at(scale, photo_side)
         losses = [name for name, weight in self.loss_weights.items() if weight > 0]
-        return StyleTargets(backbone.to(device), painting.pixels.to(device), *sides, self.style_features, losses)
+        return StyleTargets(backbone.to(device), painting.pixels.to(device), side, self.style_features, losses)
 
     def weights_at(self, step: int, level: Level) -> Dict[str, float]:
         """The weight of each loss that is on, in an iteration; that of the content loss is λ(t) (Eq. 6).
@@ -154,20 +165,32 @@ class HierStylePipeline(CheckedPipeline):
     """Told of each iteration and its losses, by a viewer that shows them."""
 
     def new_task(
-        self, style: nn.Module, painting: Painting, backbone: Backbone, effects: Decisions, iterations: int
+        self,
+        style: nn.Module,
+        painting: Painting,
+        backbone: Backbone,
+        effects: Decisions,
+        iterations: int,
+        stroke_size: Optional[float] = None,
     ) -> StyleTask:
-        """A field and a painting for the scene's views, which are shared as far as they depend on no painting."""
+        """A field and a painting for the scene's views, which are shared as far as they depend on no painting.
+
+        Strokes are of the config's size unless another is given.
+        """
         schedule = self.config.levels(iterations)
         if self.scene_views is None:
             self.scene_views = self.freeze_views()
-        targets = [self.targets_of(painting, backbone, level.scale) for level in schedule]
+        targets = [self.targets_of(painting, backbone, level.scale, stroke_size) for level in schedule]
         scales = [level.scale for level in schedule]
         views = self.scene_views.for_painting(dict(zip(scales, targets, strict=True)), effects)
         return StyleTask(style, list(map(StyleLevel, schedule, targets, views)))
 
-    def targets_of(self, painting: Painting, backbone: Backbone, scale: float = 1.0) -> StyleTargets:
+    def targets_of(
+        self, painting: Painting, backbone: Backbone, scale: float = 1.0, stroke_size: Optional[float] = None
+    ) -> StyleTargets:
         """A painting as the feature network sees it, for views at a scale of the photos."""
-        return self.config.targets_of(painting, backbone, self.device, self.datamanager.photo_side, scale)
+        config = self.config if stroke_size is None else replace(self.config, stroke_size=stroke_size)
+        return config.targets_of(painting, backbone, self.device, self.datamanager.photo_side, scale)
 
     def freeze_views(self) -> SceneViews:
         """The scene's views, with all that depends on no style."""

@@ -12,6 +12,7 @@ from sparsestyle_ns.evaluation.tables import COARSE_QUALITY, CONSISTENCY, STYLE,
 from sparsestyle_ns.metrics.art_fid import why_left_out
 from sparsestyle_ns.runs.scene_record import SceneRecord
 from sparsestyle_ns.studies.baselines import can_transfer, smooth_along_flow, transfer_frames
+from sparsestyle_ns.studies.front import front_section
 from sparsestyle_ns.studies.paper_runs import PICTURES, PaperRuns
 from sparsestyle_ns.studies.plots import line_plot
 from sparsestyle_ns.studies.run_figures import (
@@ -25,7 +26,7 @@ from sparsestyle_ns.studies.run_figures import (
 )
 from sparsestyle_ns.studies.run_queue import Run, RunQueue
 from sparsestyle_ns.studies.study import Study
-from sparsestyle_ns.studies.study_options import StudyOptions
+from sparsestyle_ns.studies.study_options import CompareOptions, StudyOptions
 from sparsestyle_ns.studies.study_page import Captioned, Plot, Section, study_page
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
@@ -237,7 +238,7 @@ def loss_plots(traces: Mapping[str, Mapping[str, Trace]], count: int) -> List[Pl
     }
     way = {name: (lines["content"][name][1], lines["style"][name][1]) for name in traces}
     mean = f"means over {count} iterations"
-    plots = [(line_plot(way, "content loss", "style loss", True), f"Way of both losses; dots: the end ({mean}).")]
+    plots = [(line_plot(way, "content loss", "style loss", "end"), f"Way of both losses; dots: the end ({mean}).")]
     for loss, series in lines.items():
         plots.append((line_plot(series, "iteration", f"{loss} loss"), f"The {loss} loss in training ({mean})."))
     return plots
@@ -248,9 +249,14 @@ def moving_mean(values: Sequence[float], count: int) -> List[float]:
     return [sum(part) / len(part) for part in (values[max(0, end - count) : end] for end in range(1, len(values) + 1))]
 
 
-def compare(options: StudyOptions) -> None:
+def compare(options: CompareOptions) -> None:
     """Trains what the comparison needs, and writes its page; an `InputError` for bad options or a failed run."""
     runs = check_options(options)
+    if options.front:
+        queue = RunQueue(options.output_dir / runs.study.name, jobs=1)  # beside another run, an iteration takes longer
+        sections = [front_section(runs, painting, queue) for painting in options.style_images]
+        finish(_write_page("Style against content", options, runs, sections), options.ablate_command())
+        return
     page = _run_study("Comparison", options, runs, [OF_METHODS], ("ours", "freenerf"))
     finish(page, options.ablate_command())
 
@@ -286,6 +292,11 @@ def _run_study(
     queue = RunQueue(options.output_dir / runs.study.name, options.jobs)
     queue.train(needed_runs(runs, comparisons, options.style_images))
     sections = study_sections(runs, comparisons, coarse_kinds, options.style_images)
+    return _write_page(title, options, runs, sections)
+
+
+def _write_page(title: str, options: StudyOptions, runs: PaperRuns, sections: Sequence[Section]) -> Path:
+    """Prints the sections' tables, and writes the page."""
     for section in sections:
         for table in section.tables:
             table.print()

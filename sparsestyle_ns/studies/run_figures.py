@@ -1,6 +1,7 @@
 """What is measured of a run. Everything is kept beside it, so that a table is made again without rendering again."""
 
 import functools
+import itertools
 import json
 import shutil
 from dataclasses import dataclass, field, replace
@@ -125,14 +126,23 @@ def measure_coarse(folder: Path) -> Dict[str, float]:
     return evaluate_run(folder / "config.yml", folder / REPORT_FILE).means
 
 
+def _logged(folder: Path) -> EventAccumulator:
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    return events.Reload()
+
+
+def iteration_times(folder: Path) -> Dict[int, float]:
+    """Seconds that a run's iterations took, by their number; of a run that logs every one, without the first."""
+    logged = sorted((event.step, event.wall_time) for event in _logged(folder).Scalars("Train Metrics Dict/style"))
+    return {step: end - start for (before, start), (step, end) in itertools.pairwise(logged) if step == before + 1}
+
+
 def loss_traces(folder: Path) -> Dict[str, Trace]:
     """`content` and `style` (the losses of Eq. 5, without λ) of a run's iterations, as it logged them.
 
     An iteration that was done twice, before and after an interruption, counts as it was done last.
     """
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
-    events.Reload()
-    traces = {}
+    events, traces = _logged(folder), {}
     for name in ("content", "style"):
         last = {event.step: event.value for event in events.Scalars(f"Train Metrics Dict/{name}")}
         traces[name] = (sorted(last), [last[step] for step in sorted(last)])

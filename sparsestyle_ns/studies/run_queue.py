@@ -51,6 +51,8 @@ class Run:
     painting: Optional[Path] = None
     coarse: Optional["Run"] = None
     """The run whose field it stylises."""
+    own_iterations: Optional[int] = None
+    """How many it has, where not as many as the study's other runs."""
     pictures: Tuple[int, ...] = ()
     """Iterations after which a picture is made of it on its way (see `preview_path`)."""
 
@@ -62,7 +64,7 @@ class Run:
     @property
     def iterations(self) -> int:
         """How many it has when it is finished."""
-        return self.study.iterations(self.stage)
+        return self.own_iterations or self.study.iterations(self.stage)
 
     @property
     def digest(self) -> str:
@@ -95,6 +97,7 @@ class Run:
     def config(self) -> SparseStyleTrainerConfig:
         """The config that trains it to its end, from where it is."""
         config = self.study.config(self.stage, dict(self.settings), self.painting)
+        config.max_num_iterations = self.iterations
         config.output_dir, config.experiment_name = self.output_dir, self.study.name
         config.timestamp = self.folder.name
         config.previews = tuple(count / self.iterations for count in self.pictures)

@@ -46,7 +46,7 @@ class StudyOptions(CommandOptions):
         other = replace(self, output_path=self.output_path.with_name("ablate.html"))
         command: List[object] = ["sparsestyle", "ablate", "--data", other.data, "--style-images", *other.style_images]
         command += ["--output-path", other.output_path]
-        for each in fields(other)[3:]:
+        for each in fields(StudyOptions)[3:]:
             value, flag = getattr(other, each.name), f"--{each.name.replace('_', '-')}"
             if value != each.default:
                 command.append(flag if value is True else f"{flag}={value}")
@@ -61,6 +61,9 @@ class CompareOptions(StudyOptions):
     the optical flow, fine-tuning the coarse field (ARF's kind), a FreeNeRF-style field fine-tuned, and ours.
     Interrupted, the same command goes on where it was.
     """
+
+    front: bool = False
+    """Draw style against kept content instead: several content weights of each way of stylising, all in equal time."""
 
 
 @dataclass

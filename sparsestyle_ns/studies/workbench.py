@@ -145,8 +145,6 @@ class Workbench:
             pipeline.style = self.style
             if self.scene_views is None:
                 self.scene_views = pipeline.freeze_views()
-            for view in self.scene_views.views:
-                view.features = None  # they depend on the size that the network sees, which a run may change
             pipeline.scene_views = self.scene_views
 
         return Training(config, self.device, self.coarse_state, share)
