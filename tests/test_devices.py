@@ -65,8 +65,8 @@ def style_config(scene: Path, painting: Path, effects: Dict[str, str] = {}, **se
         "layer_width": 16,
         "occupancy_resolution": 8,
         "bake_resolution": 16,
+        "num_steps": 12,
     }
-    sizes["num_steps"] = 12
     sizes = {f"model__{name}": value for name, value in sizes.items()}
     run = {"style_image": painting, "warm_start_steps": 1, "feature_side": 32}
     return set_up(method_config("hier-style"), scene, effects, **sizes, **{**run, **settings})

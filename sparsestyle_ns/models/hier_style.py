@@ -23,14 +23,13 @@ from sparsestyle_ns.rendering.look import Display, Look, RenderMode
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.rendering.render import FrozenSamples, PackedRender, straight_color, surface_distance
 from sparsestyle_ns.rendering.visible_samples import Marching
+from sparsestyle_ns.utils.device_sizes import sizes_for
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.numba_kernels import untraced
 from sparsestyle_ns.utils.progress import bar
 
 BAKED_RAYS = 1 << 16
 """Rays of a baked picture that are marched at once; a viewer can break it off in between."""
-RAYS_PER_CALL = 1 << 13
-"""Rays that are marched at once; bounds the memory of the steps in empty space."""
 
 
 @dataclass
@@ -159,9 +158,10 @@ class HierStyleModel(SceneModel):
         """`freeze_samples` of rays for this model's own style, by default those on which it learns."""
         marching = marching or self.learning
         with autocast(self.device, self.config.precision):
+            parts = (rays.split(sizes_for(rays.device).marched_rays) for rays in (origins, directions))
             frozen = [
                 render.freeze_samples(self.field, self.residual, self.space.segments(*part), marching)
-                for part in zip(origins.split(RAYS_PER_CALL), directions.split(RAYS_PER_CALL), strict=True)
+                for part in zip(*parts, strict=True)
             ]
             return FrozenSamples.joined(frozen, self.residual)
 

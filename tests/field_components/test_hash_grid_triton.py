@@ -48,9 +48,7 @@ def test_any_number_of_points_has_the_values_and_gradients_that_the_cpus_kernels
 def test_any_shape_of_the_table_has_the_values_and_gradients_that_the_cpus_kernels_give(levels, features, rows):
     table = torch.rand(levels, rows, features, generator=torch.Generator().manual_seed(2))
     for ours, theirs in both(places(70), table, (4, 300, 2048)[:levels]):
-        torch.testing.assert_close(
-            ours, theirs, atol=1e-4, rtol=1e-4
-        )  # a point's place in 2,048 cells has 12 bits left
+        torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)  # 12 bits say where in a cell a point is
 
 
 @pytest.fixture

@@ -51,6 +51,7 @@ from sparsestyle_ns.rendering import baked, frozen_view, mixing, visible_samples
 from sparsestyle_ns.rendering import render as volume
 from sparsestyle_ns.style import backbones, color
 from sparsestyle_ns.style.painting import Painting
+from sparsestyle_ns.utils.device_sizes import SIZES
 
 PACKAGES = [
     sparsestyle_ns.core,
@@ -445,7 +446,7 @@ def test_blocks_of_points_have_the_values_of_the_layers(count, block, width, dep
     heads = [torch.nn.Linear(7, channels, dtype=torch.float64) for channels in (3, 1)]
     inputs = [torch.randn(count, size, dtype=torch.float64) for size in (width, 2)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(blocked_mlp.BLOCK, "cpu", block)
+        patch.setitem(SIZES, "cpu", SIZES["cpu"]._replace(mlp_points=block))
         thinning = thinned_mlp.Thinning(threshold)
         found = blocked_mlp.blocked_mlp([inputs[0].requires_grad_(), inputs[1]], hidden, heads, thinning)
         (gradient,) = torch.autograd.grad(found.square().sum(), inputs[0])
