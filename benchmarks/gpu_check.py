@@ -42,8 +42,8 @@ from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.machine import device_name, synchronize, versions
 
 LEAST_PSNR = 30.0
-"""dB between a view of the coarse field after 50 steps on the device and on the CPU. Muon multiplies in bfloat16, and
-rounding grows from step to step."""
+"""dB between a view of the coarse field after 50 steps on the device and on the CPU. Rounding grows from step to step,
+and Muon multiplies in bfloat16. On one CPU, weights that differ by 1e-6 at the start end 51 dB apart (fern)."""
 MOST_GRADIENT = 0.02
 """Relative distance of the gradients of a step of stage 2. Of samples that are drawn and neighbours that are nearest by
 a hair, some are others."""
@@ -137,6 +137,11 @@ def trained_coarse(scene: Scene, decided: Decisions, device: torch.device, quick
     return training
 
 
+def likeness(first: Tensor, second: Tensor) -> float:
+    """PSNR of two pictures, in dB; equal ones have 100."""
+    return min(100.0, psnr(first, second))
+
+
 def style_gradients(training: Training) -> Tensor:
     """Gradients of the first step of stage 2, one after another, on the CPU."""
     with comparable():
@@ -154,7 +159,7 @@ def check_equal(check: "Check") -> Dict[str, float]:
     manager = config.pipeline.datamanager.setup(device="cpu", test_mode="inference")
     decided = decide(manager.scene, EffectSettings())
     coarse = [trained_coarse(scene, decided, device, quick) for device in devices]
-    found = {"coarse_psnr": psnr(*map(view_of, coarse))}
+    found = {"coarse_psnr": likeness(*map(view_of, coarse))}
     state = {name: value.cpu() for name, value in coarse[0].pipeline.model.state_dict().items()}
     config, gradients, views = small_config("hier-style", scene, decided, quick), [], []
     for device in devices:
@@ -163,7 +168,7 @@ def check_equal(check: "Check") -> Dict[str, float]:
         views.append(view_of(style, baked=True))
         gradients.append(style_gradients(style))
     found["gradient_distance"] = float((gradients[1] - gradients[0]).norm() / gradients[0].norm())
-    found["baked_psnr"] = psnr(*views)
+    found["baked_psnr"] = likeness(*views)
     check.holds(found["coarse_psnr"] >= LEAST_PSNR, f"stage 1 gives another view, {found['coarse_psnr']:.1f} dB away")
     distance = found["gradient_distance"]
     check.holds(distance <= MOST_GRADIENT, f"gradients of stage 2 are {distance:.1%} away from the CPU's")
@@ -277,15 +282,8 @@ def check_commands(check: "Check") -> Dict[str, float]:
         resumed = ["--load-dir", run / "nerfstudio_models", "--max-num-iterations", 12]
         seconds["going on"] = train(check, "hier-style-draft", outputs / "on", *resumed, *size, *style)
         config = run / "config.yml"
-        rendering = [
-            "nerfstudio.scripts.render",
-            "interpolate",
-            "--load-config",
-            config,
-            "--output-path",
-            made / "film",
-        ]
-        rendering += ["--output-format", "images", "--interpolation-steps", 2]
+        rendering = ["nerfstudio.scripts.render", "interpolate", "--load-config", config, "--output-format", "images"]
+        rendering += ["--output-path", made / "film", "--interpolation-steps", 2]
         others = {
             "ns-render": rendering,
             "ns-eval": ["nerfstudio.scripts.eval", "--load-config", config, "--output-path", made / "eval.json"],

@@ -9,7 +9,7 @@ operator runs; but their storages are marked, and what CUDA would refuse is refu
 
 What CUDA allows is allowed: numbers of no dimensions of the CPU in operators that work element by element, indices of
 the CPU, copies. What makes the CPU wait for a GPU is counted, by the line of the package that it happens in
-(`SecondDevice.waits`).
+(`SecondDevice.waits`), and so is the memory of tensors (`SecondDevice.peak_bytes`).
 
 Why storages are marked, and not a class of tensors made that says it is elsewhere: storages outlive every path through
 autograd, views and optimisers, and the tensors stay those that torch, numba and Triton's interpreter know.
@@ -33,6 +33,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 PACKAGES = ("sparsestyle_ns", "nerfstudio")
+SMALL = 1 << 14
+"""Bytes; tensors of fewer aren't counted."""
 CPU, CUDA = torch.device("cpu"), torch.device("cuda", 0)
 INDEXING = ("index", "_unsafe_index", "index_put", "index_put_", "_index_put_impl_")
 """Operators that take indices of the CPU on a GPU; the first argument says where the result is."""
@@ -127,6 +129,9 @@ class SecondDevice:
         """Names of the operators that ran on the second device."""
         self.copied_bytes: Counter[str] = Counter()
         """From the CPU, by line of the package."""
+        self.peak_bytes = 0
+        """Of all tensors there at once, but for small ones; what an operator needs inside isn't seen."""
+        self._live: List[Tuple[StorageWeakRef, int]] = []
         self.kernels = kernels and torch.version.cuda is not None
         self._state = threading.local()
         self._lock = threading.Lock()
@@ -165,6 +170,16 @@ class SecondDevice:
         with self._lock:
             self.waits[Wait(kind, where)] += 1
             self.copied_bytes[where] += num_bytes
+
+    def count_memory(self, tensor: Tensor) -> None:
+        """Takes note of a new tensor's memory, and of the most that there is at once."""
+        storage = tensor.untyped_storage()
+        if storage.nbytes() < SMALL:
+            return
+        with self._lock:
+            self._live.append((StorageWeakRef(storage), storage.nbytes()))
+            self._live = [each for each in self._live if not each[0].expired()]
+            self.peak_bytes = max(self.peak_bytes, sum(num_bytes for _, num_bytes in self._live))
 
     @property
     def within(self) -> Optional[bool]:
@@ -242,6 +257,7 @@ class _Operators(TorchDispatchMode):
             for each in _tensors(result):
                 if on_second and not each.is_meta and each.untyped_storage()._cdata not in known:
                     device.marks.set(each, True)
+                    device.count_memory(each)
             return result
 
     def _check(self, func: Any, args: Tuple, kwargs: Dict, inputs: List[Tensor], marked: List[bool]) -> None:

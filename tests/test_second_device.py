@@ -201,6 +201,13 @@ def test_what_waits_for_nothing_isnt_counted(device, work):
     assert not device.waits
 
 
+def test_the_most_memory_at_once_is_counted(device):
+    for _ in range(3):
+        kept = torch.zeros(1 << 20, device="cuda")  # 4 MiB each
+        _ = (kept + 1.0).sum() + torch.ones(1 << 20).sum().to("cuda")
+    assert device.peak_bytes == 2 * (4 << 20)  # the former is there while the next is made; the CPU's don't count
+
+
 def test_outside_nothing_is_changed():
     with SecondDevice():
         pass
