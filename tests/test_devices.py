@@ -92,13 +92,60 @@ def look(training: Training) -> None:
 OUTSIDE = {"ndc": "off", "contraction": "on"}
 
 
+def waits_of(device: SecondDevice, training: Training, steps: int = 3) -> Dict[str, float]:
+    """What an iteration waits for, by file and kind, after a first one; in iterations whose values nobody looks at."""
+    training.step()
+    device.waits.clear()
+    for _ in range(steps):
+        training.step()
+    found: Dict[str, float] = {}
+    for (kind, where), count in device.waits.items():
+        if kind != "copy on the way":
+            key = f"{kind}, {where.split(':')[0].removeprefix('sparsestyle_ns/')}"
+            found[key] = found.get(key, 0.0) + count / steps
+    return found
+
+
+def test_an_iteration_of_stage_1_waits_once(device: SecondDevice, llff_scene: Path) -> None:
+    training = Training(coarse_config(llff_scene), CUDA)
+    assert waits_of(device, training) == {"nonzero, field_components/thinned_mlp.py": 1}
+    look(training)
+
+
+STYLE_WAITS = {
+    "nonzero, field_components/thinned_mlp.py": 1,
+    "nonzero, losses/style_index.py": 3,
+    "tolist, losses/style_index.py": 4,
+}
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_an_iteration_of_stage_2_waits_for_what_decides_on_sizes_alone(
+    device: SecondDevice, llff_scene: Path, painting: Path, kept: bool
+) -> None:
+    settings = {} if kept else {"cache_gigabytes": 0.0}
+    training = Training(style_config(llff_scene, painting, **settings), CUDA, coarse_state(llff_scene, {}))
+    again = {} if kept else {"nonzero, rendering/few_samples.py": 1}
+    assert waits_of(device, training) == STYLE_WAITS | again
+
+
+slow = pytest.mark.slow
+
+
 @pytest.mark.parametrize(
     "effects, settings",
     [
-        ({}, {}),
         ({**OUTSIDE, "background": "on", "exposure": "on"}, {"model__thinning": 0.0}),
-        ({"matched_depth": "on", "empty_space": "off", "view_color": "on"}, {"model__occlusion_weight": 0.1}),
-        ({"empty_space": "auto"}, {"semantic_weight": 0.1, "semantic_every": 2, "model__frequency_reveal": 0.9}),
+        pytest.param(
+            {"matched_depth": "on", "empty_space": "off", "view_color": "on"},
+            {"model__occlusion_weight": 0.1},
+            marks=slow,
+        ),
+        pytest.param(
+            {"empty_space": "auto"},
+            {"semantic_weight": 0.1, "semantic_every": 2, "model__frequency_reveal": 0.9},
+            marks=slow,
+        ),
     ],
 )
 def test_stage_1_trains_there(device: SecondDevice, llff_scene: Path, effects: dict, settings: dict) -> None:
@@ -115,12 +162,13 @@ def test_stage_1_trains_there(device: SecondDevice, llff_scene: Path, effects: d
 @pytest.mark.parametrize(
     "effects, settings",
     [
-        ({}, {}),
         ({**OUTSIDE, "background": "on", "exposure": "on", "palette": "on"}, {"cache_gigabytes": 0.0}),
-        ({"empty_space": "off", "palette": "on"}, {"novel_views": 2, "samples_per_chunk": 512}),
-        ({"view_color": "on"}, {"model__stylised_field": "coarse"}),
-        ({"residual_density": "off"}, {"model__num_samples": None, "model__fine_encoding": "frequency"}),
-        ({}, {"model__fine_encoding": "none", "style_features": 50}),
+        pytest.param({"empty_space": "off", "palette": "on"}, {"novel_views": 2, "samples_per_chunk": 512}, marks=slow),
+        pytest.param({"view_color": "on"}, {"model__stylised_field": "coarse"}, marks=slow),
+        pytest.param(
+            {"residual_density": "off"}, {"model__num_samples": None, "model__fine_encoding": "frequency"}, marks=slow
+        ),
+        pytest.param({}, {"model__fine_encoding": "none", "style_features": 50}, marks=slow),
     ],
 )
 def test_stage_2_trains_and_renders_there(
