@@ -145,6 +145,7 @@ hier_style_paper = variant(
         "pipeline.view_scales": (1.0,),
         "pipeline.scale_shares": (1.0,),
         "pipeline.content_share": 0.5,
+        "pipeline.object_style": 1.0,
         "pipeline.loss_weights": {**dict.fromkeys(LOSSES, 0.0), "content": 10.0, "style": 1.0},
         "pipeline.model.min_resolution": 128,
         "pipeline.model.max_resolution": 512,

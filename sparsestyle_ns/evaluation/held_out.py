@@ -19,6 +19,7 @@ from sparsestyle_ns.core.occupancy import interval_lengths
 from sparsestyle_ns.core.precision import autocast
 from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.volrend import dense_weights, effective_samples, optical_depth
+from sparsestyle_ns.losses.nnfm import NNFMLoss, nearest_neighbors
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID
 from sparsestyle_ns.metrics.consistency import RANGES, PathGeometry
@@ -166,7 +167,10 @@ class StyleFigures:
 
     def __init__(self, targets: StyleTargets) -> None:
         self.targets = targets
-        self.gram = gram_matrix(targets.style_rows())
+        rows = targets.style_rows()
+        self.gram, self.num_features = gram_matrix(rows), len(rows)
+        style = targets.by_name.get("style")
+        self.index = style.index if isinstance(style, NNFMLoss) else None
         self.distance = StyleDistance(targets.style_picture)
 
     @torch.no_grad()
@@ -180,8 +184,9 @@ class StyleFigures:
 
         `style_loss` and `content_loss` are Eq. 5's: nearest neighbour feature matching, and the features' distance from
         the unstylised view; other losses of `targets` are `NAME_loss`, `gram_distance` is that of `metrics.image`,
-        `stroke_width` that of `metrics.strokes` in pixels, and the rest are of `StyleDistance`. With `accumulation`,
-        only where the scene covers the picture: a background can't be stylised.
+        `features_used` is the share of the painting's feature vectors, or where a view has fewer, of as many, that are
+        the most similar one of some place; `stroke_width` is that of `metrics.strokes` in pixels, and the rest are of
+        `StyleDistance`. With `accumulation`, only where the scene covers the picture: a background can't be stylised.
         """
         content, figures = self.targets.features(coarse), {}
         for suffix, picture in (("_before", coarse), ("", stylised)):
@@ -190,6 +195,9 @@ class StyleFigures:
             found["gram_distance"] = float(gram_distance(gram_matrix(view.features), self.gram))
             found |= self.distance.figures(picture, accumulation)
             found["stroke_width"] = stroke_width(picture)
+            if self.index is not None:
+                chosen = nearest_neighbors(view.features, self.index)
+                found["features_used"] = len(chosen.unique()) / min(len(chosen), self.num_features)
             figures |= {f"{name}{suffix}": value for name, value in found.items()}
         figures.pop("content_loss_before", None)
         return figures

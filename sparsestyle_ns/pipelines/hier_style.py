@@ -57,6 +57,8 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     """Match with at most so many of the painting's feature vectors, drawn at random; None: all of them."""
     loss_weights: Dict[str, float] = field(default_factory=default_weights)
     """Weight of each loss, 0 or more; 0 is off. That of the content loss is λ0, which falls (Eq. 6)."""
+    object_style: float = 4.0
+    """How many times the style loss's weight counts for an object on a background, which keeps its shape by itself."""
     content_decay: float = 0.01
     """α, the share of the content loss's weight that is left in the end."""
     content_share: float = 0.6
@@ -90,6 +92,8 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
                 raise InputError(f"--pipeline.loss-weights names {name}, which is no loss; the losses are {known}.")
             if not 0.0 <= weight < math.inf:
                 raise InputError(f"--pipeline.loss-weights.{name} is {weight}; give a finite number, 0 or more.")
+        if not 0.0 < self.object_style < math.inf:
+            raise InputError(f"--pipeline.object-style is {self.object_style}; give a number above 0.")
         if not any(self.loss_weights.values()):
             raise InputError("--pipeline.loss-weights turns every loss off; give one of them a weight above 0.")
         if self.style_image is None:
@@ -240,7 +244,10 @@ class HierStylePipeline(CheckedPipeline):
             task.style.thinning = Thinning(self.config.thinning, generator)
         image = self.scene_views.render(view, task.style)
         values = targets.losses(targets.view(image, view.features, view.accumulation, step))
-        return image, Losses(values, self.config.weights_at(step, schedule))
+        weights = self.config.weights_at(step, schedule)
+        if self.model.background is not None and "style" in weights:
+            weights["style"] *= self.config.object_style
+        return image, Losses(values, weights)
 
     def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Tensor], Dict[str, Tensor], Dict[str, Any]]:
         """One whole view: λ(t) L_content, L_style, and other losses that are on (Eq. 5 and 6)."""

@@ -23,7 +23,11 @@ COLORS_ALONE: Settings = {"pipeline.effects.view_color": "on", "pipeline.effects
 """What both stages have to be told of every kind of stage 1 but ours."""
 CONSTANT: Settings = {"pipeline.content_decay": 1.0, "pipeline.content_restart": 1.0}
 """The content weight stays as it is in all iterations, at each size of the views."""
-PAPER_LOSSES: Settings = {"pipeline.loss_weights.colors": 0.0, "pipeline.loss_weights.textures": 0.0}
+PAPER_LOSSES: Settings = {
+    "pipeline.loss_weights.colors": 0.0,
+    "pipeline.loss_weights.textures": 0.0,
+    "pipeline.object_style": 1.0,
+}
 """Content and style alone, as ARF and the paper have it."""
 CONTENT_WEIGHTS = (0.1, 0.01, 0.001)
 """What ours begins with, ends with, and the middle between."""

@@ -149,6 +149,14 @@ def test_strokes_beyond_half_and_twice_are_refused(size, painting):
         HierStylePipelineConfig(stroke_size=size, style_image=painting).load_style()
 
 
+def test_the_style_counts_more_for_an_object_on_a_background(training, monkeypatch):
+    pipeline = training.pipeline
+    _, everywhere = pipeline.losses(pipeline.task, 0)
+    monkeypatch.setattr(pipeline.model, "background", torch.ones(3))
+    _, of_object = pipeline.losses(pipeline.task, 0)
+    assert of_object.weights == {**everywhere.weights, "style": 4.0 * everywhere.weights["style"]}
+
+
 def test_restyling_goes_through_the_same_sizes(training, runs, painting, monkeypatch):
     pipeline = training.pipeline
     seen, losses = [], type(pipeline).losses
