@@ -237,9 +237,13 @@ def waits_an_iteration(training: Training, steps: int = 5) -> float:
 
 
 def run_command(check: "Check", *words: Any) -> float:
-    """Runs a Python module in a process of its own; seconds, or a `CheckFailedError` with the end of what it said."""
-    start = time.perf_counter()
-    command = [sys.executable, "-m", *map(str, words)]
+    """Runs `sparsestyle`, or a Python module, in a process of its own; seconds.
+
+    A `CheckFailedError`, after the end of what it said, where it fails.
+    """
+    start, words = time.perf_counter(), tuple(map(str, words))
+    program = ("-c", "from sparsestyle_ns.cli import main; main()") if words[0] == "sparsestyle" else ("-m", words[0])
+    command, named = [sys.executable, *program, *words[1:]], " ".join(words[:2])
     environment = {**os.environ, "PYTHONWARNINGS": "ignore", "PYTHONPATH": str(ROOT)}
     if check.device.type == "cpu":
         environment["CUDA_VISIBLE_DEVICES"] = ""
@@ -248,10 +252,10 @@ def run_command(check: "Check", *words: Any) -> float:
             command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=max(1.0, check.seconds_left())
         )
     except subprocess.TimeoutExpired as error:
-        raise CheckFailedError(f"{' '.join(command[2:4])} didn't end in the time that was left") from error
+        raise CheckFailedError(f"{named} didn't end in the time that was left") from error
     if done.returncode != 0:
         check.log((done.stdout + done.stderr)[-4000:])
-        raise CheckFailedError(f"{' '.join(command[2:4])} ended with status {done.returncode}; see the lines above")
+        raise CheckFailedError(f"{named} ended with status {done.returncode}; see the lines above")
     return time.perf_counter() - start
 
 
@@ -287,16 +291,19 @@ def check_commands(check: "Check") -> Dict[str, float]:
         others = {
             "ns-render": rendering,
             "ns-eval": ["nerfstudio.scripts.eval", "--load-config", config, "--output-path", made / "eval.json"],
-            "evaluate": ["sparsestyle_ns.cli", "evaluate", run, "--baked", "--output-path", made / "report.json"],
-            "effects": ["sparsestyle_ns.cli", "effects", "--data", check.scene.folder],
-            "gallery": ["sparsestyle_ns.cli", "gallery", run, "--output-path", made / "page.html", "--frames", 4],
+            "evaluate": ["sparsestyle", "evaluate", run, "--baked", "--output-path", made / "report.json"],
+            "effects": ["sparsestyle", "effects", "--data", check.scene.folder],
+            "gallery": ["sparsestyle", "gallery", run, "--output-path", made / "page.html", "--frames", 4],
         }
         for kind, suffix in (("html", "html"), ("ply", "ply")):
-            others[f"export {kind}"] = ["sparsestyle_ns.cli", "export", run, "--format", kind]
+            others[f"export {kind}"] = ["sparsestyle", "export", run, "--format", kind]
             others[f"export {kind}"] += ["--output-path", made / f"scene.{suffix}"]
         made.mkdir()
         for name, words in others.items():
             seconds[name] = run_command(check, *words)
+            if "--output-path" in words:
+                path = Path(words[words.index("--output-path") + 1])
+                check.holds(path.exists(), f"{name} ended without {path.name}")
     return seconds
 
 
@@ -310,7 +317,7 @@ def check_whole(check: "Check") -> Dict[str, Any]:
         found: Dict[str, Any] = {"coarse-fewshot, seconds": train(check, "coarse-fewshot", outputs, *flags)}
         style = ["--style-image", check.scene.style_image]
         found["hier-style, seconds"] = train(check, "hier-style", outputs, *flags, *style)
-        words = ["sparsestyle_ns.cli", "evaluate", newest_run(outputs, "hier-style"), "--output-path"]
+        words = ["sparsestyle", "evaluate", newest_run(outputs, "hier-style"), "--output-path"]
         run_command(check, *words, outputs / "report.json")
         results = json.loads((outputs / "report.json").read_text())["results"]
         found |= {name: results[name] for name in ("coarse_psnr", "style_loss", "content_loss") if name in results}

@@ -214,7 +214,7 @@ def test_all_commands_run_there(device: SecondDevice, llff_scene: Path, painting
         ns_train(method, llff_scene, tmp_path / "resumed", *resumed, *flags)
     sparsestyle("evaluate", only_run(tmp_path, "coarse-fewshot"))
     sparsestyle("evaluate", run, "--baked", "--output-path", tmp_path / "report.json")
-    sparsestyle("export", run, "--format", "html", "--output-path", tmp_path / "page.html", "--resolution", "16")
+    sparsestyle("export", run, "--format", "html", "--output-path", tmp_path / "page.html", "--resolution", "32")
     sparsestyle("export", run, "--format", "ply", "--output-path", tmp_path / "points.ply")
     sparsestyle("gallery", run, "--output-path", tmp_path / "gallery.html", "--frames", "2")
     sparsestyle("effects", "--data", llff_scene)
