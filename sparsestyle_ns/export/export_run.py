@@ -3,6 +3,7 @@
 from sparsestyle_ns.engine.hints import after_export, finish
 from sparsestyle_ns.export.export_options import ExportOptions
 from sparsestyle_ns.export.points import export_points
+from sparsestyle_ns.export.splats import export_splats
 from sparsestyle_ns.export.stylised_scene import load_scene
 from sparsestyle_ns.export.web_page import export_page
 from sparsestyle_ns.runs.run_folder import find_config
@@ -18,6 +19,8 @@ def export_run(options: ExportOptions) -> None:
     scene = load_scene(find_config(options.run))
     if options.format == "html":
         export_page(scene, options.output_path, options.resolution)
+    elif options.format == "splat":
+        export_splats(scene, options.output_path, options.max_splats, options.sh0)
     elif options.format == "ply":
         export_points(scene, options.output_path)
     else:
