@@ -66,7 +66,7 @@ def first_steps(gaussians: Gaussians) -> Float[Tensor, "gaussians 14"]:
 
 
 def least_log_scales(gaussians: Gaussians, views: Sequence[SeenView]) -> Float[Tensor, "gaussians 1"]:
-    """Logarithms of `LEAST_SIZE` in world units, by the view in which a Gaussian is largest; −inf where none sees it."""
+    """Logarithms of `LEAST_SIZE` in world units, by the view that sees a Gaussian largest; −inf where none does."""
     pixel = torch.full((len(gaussians),), torch.inf)
     for view in views:
         camera, pose = view.camera, view.camera.camera_to_worlds[0]

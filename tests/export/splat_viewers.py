@@ -19,7 +19,7 @@ PACKAGES = ("playcanvas@2.23.3", "gltf-validator@2.0.0-dev.3.10")
 """With the versions that were tried."""
 SETTLED_SECONDS = 1.0
 
-PLAYCANVAS = """<!doctype html><meta charset="utf-8"><style>body { margin: 0; background: black }</style><canvas></canvas>
+PLAYCANVAS = """<!doctype html><meta charset="utf-8"><style>body { margin: 0 }</style><canvas></canvas>
 <script type="module">
 import * as pc from "./node_modules/playcanvas/build/playcanvas.mjs";
 const canvas = document.querySelector("canvas");
@@ -94,7 +94,8 @@ def install(folder: Path) -> None:
 
 
 class _Quiet(http.server.SimpleHTTPRequestHandler):
-    extensions_map = {**http.server.SimpleHTTPRequestHandler.extensions_map, ".mjs": "text/javascript"}
+    def guess_type(self, path):
+        return "text/javascript" if str(path).endswith(".mjs") else super().guess_type(path)
 
     def log_message(self, *_):
         pass
