@@ -1,7 +1,6 @@
 """Gaussians made to look as exact pictures do: a short refit of all that they are, by Adam.
 
-Half of the steps draw them as viewers do that make up for the blur, half as the others (see `gaussians.py`), so that
-they look right in both. A step takes one view.
+Each step takes one view, and draws it as one of several viewers does (`DRAWINGS`), so that Gaussians look right in all.
 """
 
 import math
@@ -11,14 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestyle_ns.export.gaussians import Gaussians, picture_of_gaussians
+from sparsestyle_ns.export.gaussians import DRAWINGS, Gaussians, picture_of_gaussians
 from sparsestyle_ns.export.place_gaussians import SeenView
 from sparsestyle_ns.rendering.render import Background
 from sparsestyle_ns.utils.progress import bar
 
-RATES = (0.05, 0.02, 0.01, 0.05, 0.01)
+RATES = (0.1, 0.05, 0.03, 0.1, 0.03)
 """First steps of means (in a Gaussian's own size), logarithms of scales, quaternions, logits and colours."""
-LEAST_SIZE = 0.6
+LEAST_SIZE = 0.5
 """Standard deviation of a Gaussian, in pixels of the view that sees it best, at least: viewers blur and drop smaller
 ones, each in its own way."""
 LAST_RATE = 0.1
@@ -36,13 +35,14 @@ def fit_gaussians(gaussians: Gaussians, views: Sequence[SeenView], background: B
     dark, light = -start[:, 11:] / sizes[:, 11:], (1.0 - start[:, 11:]) / sizes[:, 11:]
     small = (least - start[:, 3:6]) / sizes[:, 3:6]
     generator = torch.Generator().manual_seed(0)
+    drawings = list(DRAWINGS.values())
     order, note = [], ""
     with bar("Fitting splats", steps, unit="steps") as fitting:
         for step in range(steps):
             order = order or torch.randperm(len(views), generator=generator).tolist()
             view = views[order.pop()]
-            sharpened = bool(torch.rand((), generator=generator) < 0.5)
-            shown = picture_of_gaussians(Gaussians(start + sizes * moved), view.camera, background, sharpened)
+            drawing = drawings[int(torch.randint(len(drawings), (), generator=generator))]
+            shown = picture_of_gaussians(Gaussians(start + sizes * moved), view.camera, background, drawing)
             error = (shown - view.picture).square()
             optimizer.zero_grad()
             error.sum().backward()

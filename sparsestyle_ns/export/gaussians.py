@@ -2,13 +2,14 @@
 Splatting for Real-Time Radiance Field Rendering", Sec. 4).
 
 A Gaussian with mean μ, scales s and rotation R has the covariance Σ = R S Sᵀ Rᵀ. On a picture its covariance is
-Σ' = J W Σ Wᵀ Jᵀ + 0.3 px², with W the camera's rotation and J the Jacobian of the projection at μ, and where it is seen
-at q = (p − μ')ᵀ Σ'⁻¹ (p − μ') from its centre there, its opacity is α = o exp(−q/2). Gaussians are laid over each other
-in the order of their distance along the camera's axis.
+Σ' = J W Σ Wᵀ Jᵀ + blur, with W the camera's rotation and J the Jacobian of the projection at μ, and where it is seen at
+q = (p − μ')ᵀ Σ'⁻¹ (p − μ') from its centre there, its opacity is α = o exp(−q/2). Gaussians are laid over each other in
+the order of their distance along the camera's axis. Viewers differ in details (`Drawing`).
 """
 
+import math
 from dataclasses import dataclass
-from typing import List, Tuple
+from typing import List, NamedTuple, Tuple
 
 import numpy as np
 import torch
@@ -78,22 +79,41 @@ class Gaussians:
         return self.rows[:, 11:]
 
 
-def picture_of_gaussians(
-    gaussians: Gaussians, camera: Cameras, background: Background, sharpened: bool = False
-) -> Float[Tensor, "H W 3"]:
-    """What one pinhole camera sees, on the CPU; differentiable in the Gaussians' rows.
+class Drawing(NamedTuple):
+    """In what viewers differ.
 
-    With `sharpened` opacities make up for the blur, as in "Mip-Splatting" (Yu et al. 2024): some viewers do so, most
-    don't.
+    Attributes:
+        blur: what is added to Σ', in square pixels, so that no Gaussian falls between pixels.
+        sharpened: whether opacities make up for that: times √(|Σ' before| / |Σ' after|).
+        foot: exp(−q/2) − foot, over 1 − foot, in place of exp(−q/2): it ends at 0 where Gaussians end, at q = 8.
     """
-    rgb, light = _Laid.apply(gaussians.rows, _eye(camera, sharpened))
+
+    blur: float
+    sharpened: bool = False
+    foot: float = 0.0
+
+
+DRAWINGS = {
+    "the reference": Drawing(0.3),
+    "PlayCanvas": Drawing(0.3 / 4.0, foot=math.exp(-4.0)),
+    "Spark": Drawing(0.3, sharpened=True),
+}
+"""Of Kerbl et al., PlayCanvas 2.23 (its shaders count in half pixels) and Spark 2.2."""
+
+
+def picture_of_gaussians(
+    gaussians: Gaussians, camera: Cameras, background: Background, drawing: Drawing
+) -> Float[Tensor, "H W 3"]:
+    """What a viewer shows of one pinhole camera, on the CPU; differentiable in the Gaussians' rows."""
+    rgb, light = _Laid.apply(gaussians.rows, _eye(camera, drawing))
     return over_background(rgb, 1.0 - light[..., None], background)
 
 
-def _eye(camera: Cameras, sharpened: bool) -> Eye:
+def _eye(camera: Cameras, drawing: Drawing) -> Eye:
     numbers = (np.float32(float(getattr(camera, name))) for name in ("fx", "fy", "cx", "cy"))
     pose = camera.camera_to_worlds[0].float().contiguous().numpy()
-    return Eye(pose, *numbers, int(camera.width), int(camera.height), sharpened)
+    size = int(camera.width), int(camera.height)
+    return Eye(pose, *numbers, *size, np.float32(drawing.blur), drawing.sharpened, np.float32(drawing.foot))
 
 
 class _Laid(torch.autograd.Function):
@@ -112,7 +132,7 @@ class _Laid(torch.autograd.Function):
 
         rgb, light = torch.zeros(eye.height, eye.width, 3), torch.ones(eye.height, eye.width)
         last = np.full((eye.height, eye.width), -1, np.int32)
-        drawn = (order, values, rgb.numpy(), light.numpy(), last)
+        drawn = (order, values, eye.foot, rgb.numpy(), light.numpy(), last)
         run_on_threads(splat_kernels.lay, [(*part, *drawn) for part in _line_parts(eye)])
         ctx.save_for_backward(rows)
         ctx.eye, ctx.order, ctx.values, ctx.last, ctx.light = eye, order, values, last, light.clone()
@@ -125,7 +145,7 @@ class _Laid(torch.autograd.Function):
         behind, light = (ctx.light * light_grad).numpy(), ctx.light.clone().numpy()
         parts = _line_parts(ctx.eye)
         value_grads = [np.zeros((len(rows), VALUES - 1), np.float32) for _ in parts]
-        drawn = (ctx.order, ctx.values, ctx.last, rgb_grad.contiguous().numpy(), light, behind)
+        drawn = (ctx.order, ctx.values, ctx.eye.foot, ctx.last, rgb_grad.contiguous().numpy(), light, behind)
         run_on_threads(
             splat_kernels.lay_backward, [(*part, *drawn, grads) for part, grads in zip(parts, value_grads, strict=True)]
         )

@@ -13,8 +13,6 @@ import numpy as np
 from sparsestyle_ns.utils.numba_kernels import kernel
 
 PARAMETERS, VALUES = 14, 10
-BLUR = 0.3
-"""Of Σ', in square pixels: what viewers add so that no Gaussian falls between pixels."""
 REACH = 8.0**0.5
 """An ellipse ends at so many standard deviations, as in most viewers."""
 MAX_ALPHA, MIN_ALPHA = 0.99, 1.0 / 255.0
@@ -25,7 +23,7 @@ OUT_OF_SIGHT = np.float32(np.inf)
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 _SIXTEENTH, _THIRD, _QUARTER = np.float32(1 / 16), np.float32(1 / 3), np.float32(1 / 4)
-_BLUR, _NEAREST, _CUT = np.float32(BLUR), np.float32(NEAREST), np.float32(REACH * REACH)
+_NEAREST, _CUT = np.float32(NEAREST), np.float32(REACH * REACH)
 _MAX_ALPHA, _MIN_ALPHA = np.float32(MAX_ALPHA), np.float32(MIN_ALPHA)
 _DARK = np.float32(1e-4)  # where less light than this is left, nothing is drawn any more
 _TINY = np.float32(1e-12)
@@ -41,8 +39,10 @@ class Eye(NamedTuple):
     center_y: np.float32
     width: int
     height: int
+    blur: np.float32
     sharpened: bool
-    """Whether opacities make up for the blur."""
+    foot: np.float32
+    """These three as in `gaussians.Drawing`."""
 
 
 @kernel
@@ -105,10 +105,10 @@ def _dot(first, second):
 
 
 @kernel
-def _kept_opacity(xx, xy, yy):
+def _kept_opacity(xx, xy, yy, blur):
     """By how much the blur would brighten an ellipse: √(|Σ' − blur| / |Σ'|), of Σ' without the blur."""
     before = max(xx * yy - xy * xy, _TINY)
-    return np.sqrt(before / ((xx + _BLUR) * (yy + _BLUR) - xy * xy))
+    return np.sqrt(before / ((xx + blur) * (yy + blur) - xy * xy))
 
 
 @kernel
@@ -132,8 +132,8 @@ def project(start, end, rows, eye, values, depths):
         xx, xy, yy = _dot(first, first), _dot(first, second), _dot(second, second)
         opacity = _ONE / (_ONE + np.exp(-row[10]))
         if eye.sharpened:
-            opacity *= _kept_opacity(xx, xy, yy)
-        xx, yy = xx + _BLUR, yy + _BLUR
+            opacity *= _kept_opacity(xx, xy, yy, eye.blur)
+        xx, yy = xx + eye.blur, yy + eye.blur
         if opacity <= _MIN_ALPHA:
             continue
         reach_x, reach_y = np.sqrt(_CUT * xx), np.sqrt(_CUT * yy)
@@ -187,11 +187,18 @@ def _bell(q):
 
 
 @kernel
-def lay(start, end, order, values, rgb, light, last):
+def _shape(q, foot):
+    """The share of its opacity that an ellipse has at q: a bell, which is lowered so far that it ends at 0."""
+    return (_bell(q) - foot) / (_ONE - foot)
+
+
+@kernel
+def lay(start, end, order, values, foot, rgb, light, last):
     """Draws ellipses on the rows of pixels from `start` to `end`.
 
     Args:
         order: numbers of the ellipses, the nearest first.
+        foot: what is taken from all bells.
         rgb, light, last: results: colours, the light that is left, and the last place in `order` that drew in a pixel.
     """
     width = rgb.shape[1]
@@ -208,7 +215,7 @@ def lay(start, end, order, values, rgb, light, last):
                     continue
                 across = np.float32(column) + _HALF - value[0]
                 q = value[2] * across * across + (_TWO * value[3] * across + value[4] * down) * down
-                weight = before * min(_MAX_ALPHA, value[5] * _bell(q))
+                weight = before * min(_MAX_ALPHA, value[5] * _shape(q, foot))
                 rgb[line, column, 0] += weight * value[6]
                 rgb[line, column, 1] += weight * value[7]
                 rgb[line, column, 2] += weight * value[8]
@@ -217,7 +224,7 @@ def lay(start, end, order, values, rgb, light, last):
 
 
 @kernel
-def lay_backward(start, end, order, values, last, rgb_grad, light, behind, grads):
+def lay_backward(start, end, order, values, foot, last, rgb_grad, light, behind, grads):
     """The gradients of `lay`, back to front.
 
     Args:
@@ -240,7 +247,7 @@ def lay_backward(start, end, order, values, last, rgb_grad, light, behind, grads
                     continue
                 across = np.float32(column) + _HALF - value[0]
                 q = value[2] * across * across + (_TWO * value[3] * across + value[4] * down) * down
-                shape = _bell(q)
+                shape = _shape(q, foot)
                 alpha = min(_MAX_ALPHA, value[5] * shape)
                 passed = _ONE / (_ONE - alpha)
                 before = light[line, column] * passed
@@ -255,7 +262,7 @@ def lay_backward(start, end, order, values, last, rgb_grad, light, behind, grads
                 light[line, column] = before
                 if alpha < _MAX_ALPHA:
                     sum_o += alpha_grad * shape
-                    q_grad = -_HALF * alpha * alpha_grad
+                    q_grad = -_HALF * value[5] * (shape + foot / (_ONE - foot)) * alpha_grad
                     sum_q += q_grad
                     sum_x += q_grad * across
                     sum_xx += q_grad * across * across
@@ -283,12 +290,12 @@ def _spread_grads(value, grad):
 
 
 @kernel
-def _sharp_grads(xx, xy, yy, opacity_grad):
+def _sharp_grads(xx, xy, yy, blur, opacity_grad):
     """∂L/∂Σ' through an opacity that makes up for the blur, of Σ' without the blur."""
     before = xx * yy - xy * xy
     if before <= _TINY:
         return _ZERO, _ZERO, _ZERO
-    blurred_x, blurred_y = xx + _BLUR, yy + _BLUR
+    blurred_x, blurred_y = xx + blur, yy + blur
     after = blurred_x * blurred_y - xy * xy
     return (
         _HALF * opacity_grad * (yy / before - blurred_y / after),
@@ -328,9 +335,9 @@ def project_backward(start, end, order, rows, eye, values, value_grads, grads):
         opacity_grad = value_grad[5]
         if eye.sharpened:
             xx, xy, yy = _dot(first, first), _dot(first, second), _dot(second, second)
-            more = _sharp_grads(xx, xy, yy, opacity_grad * value[5])
+            more = _sharp_grads(xx, xy, yy, eye.blur, opacity_grad * value[5])
             xx_grad, xy_grad, yy_grad = xx_grad + more[0], xy_grad + more[1], yy_grad + more[2]
-            opacity_grad *= _kept_opacity(xx, xy, yy)
+            opacity_grad *= _kept_opacity(xx, xy, yy, eye.blur)
         opacity = _ONE / (_ONE + np.exp(-row[10]))
         grad[10] = opacity_grad * opacity * (_ONE - opacity)
         grad[11], grad[12], grad[13] = value_grad[6], value_grad[7], value_grad[8]

@@ -67,6 +67,7 @@ window.look = (columns, focal, width, height, background) => {
   camera.setPosition(pose.getTranslation());
   camera.setRotation(new pc.Quat().setFromMat4(pose));
 };
+window.app = app;
 window.ready = true;
 </script>
 """
