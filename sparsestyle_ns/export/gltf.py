@@ -7,7 +7,7 @@ shows coloured points. glTF's worlds stand with y up: where nerfstudio's have z 
 import json
 import math
 import struct
-from typing import Dict, List, NamedTuple, Optional
+from typing import Dict, List, NamedTuple, Union
 
 import numpy as np
 import torch
@@ -19,6 +19,8 @@ from sparsestyle_ns.export.gaussians import Gaussians
 from sparsestyle_ns.export.splat_file import coefficients
 
 SPLATTING, UNLIT = "KHR_gaussian_splatting", "KHR_materials_unlit"
+GLB_FLOATS = 15
+"""Numbers of four bytes that a Gaussian takes in a file."""
 GENERATOR = "sparsestyle_ns"
 POINTS, TRIANGLES = 0, 4
 FLOAT, UNSIGNED_BYTE, UNSIGNED_INT = 5126, 5121, 5125
@@ -36,14 +38,14 @@ class ColoredMesh(NamedTuple):
     triangles: Int[np.ndarray, "triangles 3"]
 
 
-def encode_gltf(gaussians: Optional[Gaussians], mesh: Optional[ColoredMesh], space: Space) -> bytes:
-    """A .glb file of Gaussians, of a mesh, or of both."""
+def encode_gltf(content: Union[Gaussians, ColoredMesh], space: Space) -> bytes:
+    """A .glb file of Gaussians or of a mesh, in a space's world."""
     writer = _Writer()
     turn = {} if isinstance(space, ForwardFacingSpace) else {"rotation": list(Z_UP)}
-    if gaussians is not None:
-        writer.add("Splats", writer.splats(gaussians), turn)
-    if mesh is not None:
-        writer.add("Mesh", writer.mesh(mesh), turn)
+    if isinstance(content, Gaussians):
+        writer.add("Splats", writer.splats(content), turn)
+    else:
+        writer.add("Mesh", writer.mesh(content), turn)
     return writer.encoded()
 
 

@@ -16,6 +16,7 @@ from sparsestyle_ns.data.view_selection import evenly_spaced
 from sparsestyle_ns.evaluation.held_out import exact_outputs
 from sparsestyle_ns.export.fit_gaussians import fit_gaussians
 from sparsestyle_ns.export.gaussians import DRAWINGS, Gaussians, picture_of_gaussians
+from sparsestyle_ns.export.gltf import GLB_FLOATS, encode_gltf
 from sparsestyle_ns.export.orbit import SURVEY_SIDE, make_orbit, pinholes, turned
 from sparsestyle_ns.export.place_gaussians import look_at, place_gaussians
 from sparsestyle_ns.export.splat_file import FULL_FLOATS, SMALL_FLOATS, encode_splats
@@ -44,12 +45,17 @@ def most_splats(asked: Optional[int], floats: int) -> int:
     return min(MOST_SPLATS, (MAX_BYTES - 2000) // (4 * floats)) if asked is None else asked
 
 
-def export_splats(scene: StylisedScene, output_path: Path, asked: Optional[int], small: bool) -> None:
-    """Writes a scene's Gaussians as PLY, and prints their number and error; `InputError` if nothing can be seen."""
-    gaussians = make_splats(scene, most_splats(asked, SMALL_FLOATS if small else FULL_FLOATS))
-    content = encode_splats(gaussians, small)
-    write_output(output_path, content, "The splats", "scene.ply")
-    print(f"{len(gaussians):,} splats, {len(content) / 1e6:.1f} MB, in nerfstudio's coordinates")
+def export_splats(scene: StylisedScene, output_path: Path, asked: Optional[int], small: bool, glb: bool) -> None:
+    """Writes a scene's Gaussians as PLY, or as glTF, and prints their number and error; `InputError` if none are seen.
+
+    A `small` PLY leaves out what is 0 in every one of them.
+    """
+    floats = GLB_FLOATS if glb else SMALL_FLOATS if small else FULL_FLOATS
+    gaussians = make_splats(scene, most_splats(asked, floats))
+    content = encode_gltf(gaussians, scene.model.space) if glb else encode_splats(gaussians, small)
+    write_output(output_path, content, "The splats", "scene.glb" if glb else "scene.ply")
+    frame = "glTF's coordinates, y up" if glb else "nerfstudio's coordinates"
+    print(f"{len(gaussians):,} splats, {len(content) / 1e6:.1f} MB, in {frame}")
     print_likeness_of_splats(scene, gaussians)
 
 
