@@ -39,7 +39,6 @@ from sparsestyle_ns.pipelines.datamanager import FewShotDataManager
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
 from sparsestyle_ns.rendering.render import over_background
 from sparsestyle_ns.runs.coarse_run import CoarseRun, find_coarse_run
-from sparsestyle_ns.runs.scene_record import record_scene
 from sparsestyle_ns.utils.errors import InputError
 
 BACKBONE = "vgg16-shift-tolerant"
@@ -136,14 +135,12 @@ def find_or_train_coarse(scene: Scene, options: Options) -> CoarseRun:
     folder = CACHE / "coarse" / ("-".join([scene.name, iterations] + ["quick"] * options.quick))
     manager = load_photos(scene)
     effects = decide(manager.scene, EffectSettings())
-    record = record_scene(scene.folder, manager.train_dataparser_outputs, effects)
+    record = manager.record(effects)
     found = find_coarse_run(folder, [COARSE_METHOD], record)
     if found is None:
         print(f"Training a coarse run of {iterations} iterations, once; it is kept in {folder}", flush=True)
         command = ["-m", "nerfstudio.scripts.train", COARSE_METHOD, "--data", scene.folder, "--output-dir", folder]
         command += ["--max-num-iterations", iterations]
-        for group in ("fields", "hidden_layers"):
-            command += [f"--optimizers.{group}.scheduler.max-steps", iterations]
         command += ["--machine.device-type", device, "--vis", "tensorboard", "--viewer.quit-on-train-completion"]
         command += ["True", *(QUICK_COARSE if options.quick else [])]
         command += ["llff-data"]

@@ -40,7 +40,10 @@ def check_ranges(options: object, **ranges: tuple[float, float]) -> None:
 
 
 def exit_status(work: Callable[[], None]) -> int:
-    """Runs a script's work, which makes all of something or nothing. Returns 0, or 1 after saying why it failed."""
+    """Runs a script's work, which makes all of something or nothing.
+
+    Returns 0, 1 after saying why it failed, or 130 after Ctrl-C.
+    """
     try:
         work()
     except ScriptError as error:
@@ -48,7 +51,7 @@ def exit_status(work: Callable[[], None]) -> int:
         return 1
     except KeyboardInterrupt:
         print("Error: Interrupted; nothing was changed.", file=sys.stderr)
-        return 1
+        return 130
     return 0
 
 

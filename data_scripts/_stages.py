@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Callable, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
+NOTES = ".finished"
+"""Folder of the notes about finished stages."""
 LINES_OF_A_FAILURE = 20
 SILENCE = 20.0
 """Seconds without output after which a command is said to be still running."""
@@ -65,7 +67,7 @@ def run_stages(folder: Path, stages: Sequence[Stage], force: bool = False) -> Li
     stale = force
     for number, stage in enumerate(stages, start=1):
         heading = f"[{number}/{len(stages)}] {stage.heading}"
-        note = folder / ".finished" / stage.name
+        note = folder / NOTES / stage.name
         is_made = note.is_file() and note.read_text() == stage.key and any(folder.glob(stage.product))
         stale = stale or not is_made
         if not stale:

@@ -19,10 +19,12 @@ from typing import Annotated, List, Literal, Optional, Sequence
 import tyro
 from _command_line import check_ranges, parse, print_made
 from _flight import flight
-from _stages import Stage, StageFailedError, clock, run_stages
+from _stages import NOTES, Stage, StageFailedError, clock, run_stages
 
 SCRIPTS = Path(__file__).resolve().parent
 COARSE, STYLE = "coarse-fewshot-draft", "hier-style-draft"
+PRODUCTS = ("scene", "style.png", "outputs", "camera_path.json", "stylised.mp4", "index.html")
+"""What the demo writes into its folder."""
 CHECKPOINTS = "outputs/*/{}/*/nerfstudio_models/*.ckpt"
 DRAFT = tyro.conf.arg(metavar="INT", help_behavior_hint="(default: the draft's own)")
 
@@ -61,7 +63,7 @@ def make_stages(options: Options) -> List[Stage]:
     film, page = folder / "stylised.mp4", folder / "index.html"
     scene_flags = ["--layout", options.scene, "--width", "252"]
     make_scene = ["python", str(SCRIPTS / "make_sample_scene.py"), str(folder / "scene"), *scene_flags, "--force"]
-    make_style = ["python", str(SCRIPTS / "make_style_image.py"), str(style)]
+    make_style = ["python", str(SCRIPTS / "make_style_image.py"), str(style), "--force"]
     coarse = train_command(COARSE, [], scene, outputs, options.iterations_coarse)
     stylised = train_command(STYLE, ["--style-image", str(style)], scene, outputs, options.iterations_style)
 
@@ -77,7 +79,7 @@ def make_stages(options: Options) -> List[Stage]:
     def show() -> List[List[str]]:
         run = newest_run(outputs / scene.name, STYLE)
         command = ["sparsestyle", "gallery", str(run), "--output-path", str(page), "--video", str(film)]
-        return [[*command, "--title", "A few photos and a painting"]]
+        return [[*command, "--title", "A few photos and a painting", "--force"]]
 
     rendering = f"{options.frames} frames of {options.film_side} pixels" + ", also as pictures" * options.images
     return [
@@ -88,6 +90,15 @@ def make_stages(options: Options) -> List[Stage]:
         Stage("film", "Filming a flight through the scene", render, film.name, rendering),
         Stage("page", "Laying out the page", show, page.name),
     ]
+
+
+def claim_folder(folder: Path) -> None:
+    """Makes the demo's folder; StageFailedError where files there that aren't the demo's would be written over."""
+    notes = folder / NOTES
+    taken = [name for name in PRODUCTS if (folder / name).exists()]
+    if taken and not notes.is_dir():
+        raise StageFailedError(f"{folder} has a {taken[0]} that isn't the demo's; name a new folder with --output.")
+    notes.mkdir(parents=True, exist_ok=True)
 
 
 def train_command(method: str, flags: List[str], scene: Path, outputs: Path, iterations: Optional[int]) -> List[str]:
@@ -118,7 +129,7 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     start = time.monotonic()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the command that is under way ends too
     try:
-        options.output.mkdir(parents=True, exist_ok=True)
+        claim_folder(options.output)
         durations = run_stages(options.output, make_stages(options), options.force)
     except StageFailedError as error:
         print(f"\nError: {error}", file=sys.stderr)

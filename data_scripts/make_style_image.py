@@ -363,6 +363,9 @@ class Options:
     palette: tyro.extras.literal_type_from_choices(PALETTES) = "night"
     """Which paints."""
 
+    force: bool = False
+    """Replace OUTPUT if it is there already."""
+
     def __post_init__(self) -> None:
         check_ranges(self, seed=(0, math.inf))
         if self.output.suffix.lower() not in (".png", ".jpg", ".jpeg"):
@@ -375,6 +378,8 @@ def write_picture(options: Options) -> None:
     Raises:
         ScriptError: It is too small to be painted, or cannot be written.
     """
+    if options.output.exists() and not options.force:
+        raise ScriptError(f"{options.output} exists already; add --force to replace it, or choose another OUTPUT.")
     try:
         picture = paint(options.size, options.seed, options.palette)
         options.output.parent.mkdir(parents=True, exist_ok=True)

@@ -5,7 +5,8 @@ A subcommand is a class of options, whose docstrings are its help, and a functio
 
 import importlib
 import sys
-from typing import Dict, Optional, Sequence, Tuple, Type
+from dataclasses import fields
+from typing import Dict, List, Optional, Sequence, Set, Tuple, Type
 
 import tyro
 
@@ -15,6 +16,7 @@ from sparsestyle_ns.gallery.gallery_options import GalleryOptions
 from sparsestyle_ns.prepare.prepare_options import EffectsOptions, PrepareOptions
 from sparsestyle_ns.studies.study_options import AblateOptions, CompareOptions, TradeoffOptions
 from sparsestyle_ns.utils.errors import CommandOptions, exit_on_input_error
+from sparsestyle_ns.utils.interrupts import end_on_ctrl_c, ended_by_ctrl_c
 
 SUBCOMMANDS: Dict[str, Tuple[Type[CommandOptions], str]] = {
     "ablate": (AblateOptions, "studies.paper_studies:ablate"),
@@ -29,19 +31,39 @@ SUBCOMMANDS: Dict[str, Tuple[Type[CommandOptions], str]] = {
 """Each subcommand's options, and the function that takes them."""
 
 
+def with_dashes(arguments: List[str]) -> List[str]:
+    """The command line with the two dashes behind which a dataparser's own options come, where they were left out."""
+    options, _ = SUBCOMMANDS.get(arguments[0] if arguments else "", (None, ""))
+    if options is None or "--" in arguments or not hasattr(options, "dataparser"):
+        return arguments
+    own = {f"--{each.name.replace('_', '-')}" for each in fields(options)}
+    for place, (before, word, after) in enumerate(zip(arguments, arguments[1:], arguments[2:], strict=False), start=1):
+        is_of_parser = after.startswith("--") and after.split("=")[0].replace("_", "-") not in own
+        if is_of_parser and not before.startswith("-") and word in dataparser_names():
+            return [*arguments[:place], "--", *arguments[place:]]
+    return arguments
+
+
+def dataparser_names() -> Set[str]:
+    """Those that nerfstudio knows."""
+    from nerfstudio.configs.dataparser_configs import all_dataparsers  # takes seconds, and is rarely needed
+
+    return set(all_dataparsers)
+
+
 @exit_on_input_error
 def main(arguments: Optional[Sequence[str]] = None) -> None:
     """The command line; `arguments` default to the process's own."""
-    try:
+    if arguments is None:
+        end_on_ctrl_c()
+    with ended_by_ctrl_c():
         options: CommandOptions = tyro.extras.subcommand_cli_from_dict(
             {name: options for name, (options, _) in SUBCOMMANDS.items()},
             prog="sparsestyle",
             description="Tools around stylised scenes. Training, rendering and viewing are nerfstudio's ns-* commands.",
-            args=arguments,
+            args=with_dashes(sys.argv[1:] if arguments is None else list(arguments)),
         )
+        options.expand_paths()
         options.check()
         module, function = dict(SUBCOMMANDS.values())[type(options)].split(":")
         getattr(importlib.import_module(f"sparsestyle_ns.{module}"), function)(options)
-    except KeyboardInterrupt:
-        print("Stopped by Ctrl-C.", file=sys.stderr)
-        raise SystemExit(130) from None

@@ -2,16 +2,16 @@
 
 import copy
 import functools
-from typing import Any, Dict, Optional, Sequence, Type
+from typing import Any, Dict, Optional, Type
 
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, ViewerConfig
-from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig, MultiStepSchedulerConfig, SchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from sparsestyle_ns.effects.decisions import EffectSettings
+from sparsestyle_ns.engine.schedules import ShareSchedulerConfig
 from sparsestyle_ns.engine.style_trainer import HierStyleTrainerConfig
 from sparsestyle_ns.engine.trainer import CoarseFewShotTrainer, SparseStyleTrainerConfig
-from sparsestyle_ns.engine.training import FusedAdamConfig, MuonConfig, WarmUpSchedulerConfig
+from sparsestyle_ns.engine.training import FusedAdamConfig, MuonConfig
 from sparsestyle_ns.losses.stylization import LOSSES
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipelineConfig
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
@@ -19,24 +19,15 @@ from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 from sparsestyle_ns.viewer.panel import EffectsPanel, StylePanel
 
 
-def adam(lr: float, scheduler: Optional[SchedulerConfig] = None) -> Dict[str, Any]:
+def adam(lr: float, scheduler: Optional[ShareSchedulerConfig] = None) -> Dict[str, Any]:
     """Adam for a group of parameters, and how its learning rate falls."""
     return {"optimizer": FusedAdamConfig(lr=lr), "scheduler": scheduler}
 
 
-def coarse_optimizers(iterations: int) -> Dict[str, Any]:
+def coarse_optimizers() -> Dict[str, Any]:
     """Muon for the hidden layers' matrices, which is several times as fast as Adam alone; learning rates fall."""
-
-    def falling(lr_final: float) -> SchedulerConfig:
-        return ExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=iterations)
-
-    muon = {"optimizer": MuonConfig(lr=0.02), "scheduler": falling(4e-4)}
-    return {"fields": adam(1e-3, falling(1e-4)), "hidden_layers": muon}
-
-
-def style_optimizers(milestones: Sequence[int]) -> Dict[str, Any]:
-    """Adam with a warm-up, whose learning rate is a third from each of some iterations on."""
-    return {"fields": adam(5e-3, WarmUpSchedulerConfig(milestones=tuple(milestones)))}
+    muon = {"optimizer": MuonConfig(lr=0.02), "scheduler": ShareSchedulerConfig(final=0.02)}
+    return {"fields": adam(1e-3, ShareSchedulerConfig(final=0.1)), "hidden_layers": muon}
 
 
 def method(
@@ -68,19 +59,18 @@ def variant(of: MethodSpecification, suffix: str, description: str, settings: Di
     return MethodSpecification(config, description)
 
 
-COARSE_ITERATIONS, STYLE_ITERATIONS = 3000, 200
 coarse_fewshot = method(
     SparseStyleTrainerConfig,
     "Coarse radiance field from three to eight photos (stage 1): under four minutes on two CPU cores at 504 pixels.",
     _target=CoarseFewShotTrainer,
     method_name="coarse-fewshot",
-    max_num_iterations=COARSE_ITERATIONS,
+    max_num_iterations=3000,
     steps_per_save=1000,
     steps_per_log=50,
     pipeline=CoarseFewShotPipelineConfig(
         datamanager=FewShotDataManagerConfig(train_num_rays_per_batch=256), panel=EffectsPanel
     ),
-    optimizers=coarse_optimizers(COARSE_ITERATIONS),
+    optimizers=coarse_optimizers(),
 )
 
 
@@ -94,11 +84,11 @@ hier_style = method(
     "A coarse-fewshot scene in the style of a painting, --style-image FILE (stage 2); both under ten minutes there.",
     coarse_method=coarse_fewshot_config,
     method_name="hier-style",
-    max_num_iterations=STYLE_ITERATIONS,
+    max_num_iterations=200,
     steps_per_save=50,
     steps_per_log=5,
     pipeline=HierStylePipelineConfig(datamanager=FewShotDataManagerConfig(), panel=StylePanel),
-    optimizers=style_optimizers([STYLE_ITERATIONS // 2, STYLE_ITERATIONS * 4 // 5]),
+    optimizers={"fields": adam(5e-3, ShareSchedulerConfig(warm_up=0.075, milestones=(0.5, 0.8)))},
 )
 
 DRAFT = {"preview_side": 128, "pipeline.datamanager.max_image_side": 252}
@@ -107,7 +97,7 @@ coarse_fewshot_draft = variant(
     coarse_fewshot,
     "-draft",
     f"coarse-fewshot {A_FIRST_LOOK}",
-    {**DRAFT, "max_num_iterations": 1000, "steps_per_save": 500, "optimizers": coarse_optimizers(1000)},
+    {**DRAFT, "max_num_iterations": 1000, "steps_per_save": 500},
 )
 
 
@@ -120,12 +110,7 @@ hier_style_draft = variant(
     hier_style,
     "-draft",
     f"hier-style {A_FIRST_LOOK}",
-    {
-        **DRAFT,
-        "coarse_method": coarse_fewshot_draft_config,
-        "max_num_iterations": 80,
-        "optimizers": style_optimizers([40, 64]),
-    },
+    {**DRAFT, "coarse_method": coarse_fewshot_draft_config, "max_num_iterations": 80},
 )
 
 THE_PAPER = "with the paper's own settings: hours on a CPU, for comparisons."
@@ -160,12 +145,13 @@ hier_style_paper = variant(
         "pipeline.view_scales": (1.0,),
         "pipeline.scale_shares": (1.0,),
         "pipeline.content_share": 0.5,
+        "pipeline.object_style": 1.0,
         "pipeline.loss_weights": {**dict.fromkeys(LOSSES, 0.0), "content": 10.0, "style": 1.0},
         "pipeline.model.min_resolution": 128,
         "pipeline.model.max_resolution": 512,
         "pipeline.warm_start_steps": 0,
         "pipeline.thinning": 0.0,
-        "optimizers": {"fields": adam(5e-3, MultiStepSchedulerConfig(gamma=0.33, milestones=(50, 100)))},
+        "optimizers": {"fields": adam(5e-3, ShareSchedulerConfig(milestones=(0.25, 0.5)))},
     },
 )
 

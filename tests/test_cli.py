@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from sparsestyle_ns.cli import SUBCOMMANDS, main
+from sparsestyle_ns.cli import SUBCOMMANDS, main, with_dashes
 from sparsestyle_ns.gallery import make_gallery
 from sparsestyle_ns.gallery.film import read_film
 
@@ -128,3 +128,21 @@ def test_another_painting_is_not_measured_into_the_runs_own_report(tmp_path, cap
     (tmp_path / "config.yml").write_text("method_name: hier-style\n")
     message, _ = run_main(["evaluate", str(tmp_path), "--style-image", "other.jpg"], capsys)
     assert message.startswith("Error: evaluation.json in the run's folder is for its own painting;")
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ("effects --data fern llff-data --eval-interval 4", "effects --data fern -- llff-data --eval-interval 4"),
+        ("effects --data fern -- llff-data --eval-interval 4", None),
+        ("effects llff-data --data fern", None),
+        ("effects --data fern llff-data", None),
+        ("effects --data colmap --json", None),
+        ("gallery colmap --evaluate", None),
+        ("tradeoff --data x colmap --colmap-path sparse/0", "tradeoff --data x -- colmap --colmap-path sparse/0"),
+        ("--help", None),
+        ("", None),
+    ],
+)
+def test_options_of_a_dataparser_need_no_dashes_before_it(given, expected):
+    assert with_dashes(given.split()) == (expected or given).split()

@@ -60,6 +60,13 @@ def press_ctrl_c_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
     monkeypatch.setattr(SparseStyleTrainer, "train_iteration", press)
 
 
+def train_until_ctrl_c(*arguments: object) -> None:
+    """`ns_train` where Ctrl-C comes, which ends the command with status 130."""
+    with pytest.raises(SystemExit) as ended:
+        ns_train(*arguments)
+    assert ended.value.code == 130
+
+
 def assert_same_state(first: dict, second: dict) -> None:
     assert first.keys() == second.keys()
     for key, value in first.items():
@@ -100,7 +107,7 @@ def test_variants_named_after_the_paper_have_its_settings() -> None:
     assert (field.num_levels, field.num_layers) == (7, 6)
     optimizer, scheduler = (style.optimizers["fields"][part] for part in ("optimizer", "scheduler"))
     assert (optimizer.lr, optimizer.betas) == (5e-3, (0.9, 0.999))
-    assert (scheduler.gamma, scheduler.milestones) == (0.33, (50, 100))
+    assert (scheduler.gamma, scheduler.milestones, scheduler.warm_up) == (0.33, (0.25, 0.5), 0.0)
     settings, model = style.pipeline, style.pipeline.model
     (level,) = settings.levels(style.max_num_iterations)
     assert (level.scale, level.length) == (1.0, 200)
@@ -247,7 +254,7 @@ def test_a_resumed_run_ends_as_one_that_was_never_stopped(
     ns_train(method, llff_scene, tmp_path / "whole", "--max-num-iterations", "6", *flags)
     with monkeypatch.context() as patch:
         press_ctrl_c_at(patch, step=2)
-        ns_train(method, llff_scene, tmp_path / "first", "--max-num-iterations", "6", *flags)
+        train_until_ctrl_c(method, llff_scene, tmp_path / "first", "--max-num-iterations", "6", *flags)
     first = only_run(tmp_path / "first", method)
     resume = ["--load-dir", str(first / "nerfstudio_models"), "--max-num-iterations", "6"]
     ns_train(method, llff_scene, tmp_path / "second", *resume, *flags)
@@ -267,7 +274,7 @@ def test_ctrl_c_takes_nothing_from_the_iteration_it_comes_in(
     ns_train("coarse-fewshot", llff_scene, tmp_path / "whole", *flags)
     with monkeypatch.context() as patch:
         press_ctrl_c_at(patch, step=4)
-        ns_train("coarse-fewshot", llff_scene, tmp_path / "first", *flags)
+        train_until_ctrl_c("coarse-fewshot", llff_scene, tmp_path / "first", *flags)
     first, whole = (only_run(tmp_path / name, "coarse-fewshot") for name in ("first", "whole"))
     assert [path.name for path in (first / "previews").iterdir()] == ["after-000005.png"]
     ns_train("coarse-fewshot", llff_scene, tmp_path / "second", "--load-dir", str(first / "nerfstudio_models"), *flags)
@@ -317,15 +324,15 @@ def test_hier_style_trains_the_coarse_run_itself_where_there_is_none(
 
 @pytest.mark.usefixtures("short_coarse")
 def test_a_coarse_run_that_ctrl_c_ends_within_hier_style_is_finished_by_the_command_it_names(
-    llff_scene: Path, painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    llff_scene: Path, painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     from nerfstudio.scripts import train
 
     style = ["--style-image", str(painting), "--num-views", "2", "--max-num-iterations", "1", *TINY_STYLE]
-    with monkeypatch.context() as patch, pytest.raises(SystemExit) as ended:
+    with monkeypatch.context() as patch:
         press_ctrl_c_at(patch, step=0)
-        ns_train("hier-style", llff_scene, tmp_path, *style)
-    (resume,) = re.findall("finish it with (ns-train .*) and run this command again", str(ended.value.code))
+        train_until_ctrl_c("hier-style", llff_scene, tmp_path, *style)
+    (resume,) = re.findall("finish it with (ns-train .*) and run this command again", capsys.readouterr().err)
     interrupted = only_run(tmp_path, "coarse-fewshot")
     time.sleep(1)  # runs are named by the second, and the one that goes on is to be another one
     run_entrypoint(train.entrypoint, shlex.split(resume)[1:])
@@ -341,7 +348,7 @@ def test_ctrl_c_leaves_a_checkpoint_that_renders(
     llff_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     press_ctrl_c_at(monkeypatch, step=2)
-    ns_train("coarse-fewshot", llff_scene, tmp_path / "outputs", "--max-num-iterations", "50", *TINY)
+    train_until_ctrl_c("coarse-fewshot", llff_scene, tmp_path / "outputs", "--max-num-iterations", "50", *TINY)
     run = only_run(tmp_path / "outputs", "coarse-fewshot")
     assert load(run)["step"] == 2
     printed = capsys.readouterr().out

@@ -1,11 +1,11 @@
 """What the methods are set to: for people, for a first look, and as the paper has them."""
 
+from dataclasses import replace
+
 import pytest
-import torch
-from nerfstudio.engine.schedulers import MultiStepSchedulerConfig
 
 from sparsestyle_ns.core.schedules import Level, content_weight
-from sparsestyle_ns.engine.training import FusedAdamConfig, MuonConfig, WarmUpSchedulerConfig
+from sparsestyle_ns.engine.training import FusedAdamConfig, MuonConfig
 from sparsestyle_ns.method_configs import method_config
 
 STAGES = ("coarse-fewshot", "hier-style")
@@ -33,8 +33,7 @@ def test_stage_1_learns_matrices_with_muon_and_all_else_with_adam_both_slower_an
     kinds = {name: type(group["optimizer"]) for name, group in config.optimizers.items()}
     assert kinds == {"fields": FusedAdamConfig, "hidden_layers": MuonConfig}
     for group in config.optimizers.values():
-        assert group["scheduler"].max_steps == config.max_num_iterations
-        assert group["scheduler"].lr_final < group["optimizer"].lr
+        assert 0.0 < group["scheduler"].final < 1.0
 
 
 @pytest.mark.parametrize("variant", ["", "-draft"])
@@ -61,8 +60,9 @@ def test_the_papers_stage_2_has_200_iterations_on_whole_photos_whose_rate_falls_
     assert config.max_num_iterations == 200
     optimizer, scheduler = (config.optimizers["fields"][part] for part in ("optimizer", "scheduler"))
     assert (optimizer.lr, optimizer.betas) == (5e-3, (0.9, 0.999))
-    assert type(scheduler) is MultiStepSchedulerConfig
-    assert (scheduler.gamma, tuple(scheduler.milestones)) == (0.33, (50, 100))
+    schedule = replace(scheduler, iterations=200)
+    rates = [schedule.factor(step) for step in (0, 49, 50, 99, 100, 199)]
+    assert rates == pytest.approx([1, 1, 0.33, 0.33, 0.1089, 0.1089])
     assert config.pipeline.levels(200) == (Level(1.0, 0, 200),)
     assert config.pipeline.warm_start_steps == 0 and config.pipeline.thinning == 0
 
@@ -86,15 +86,3 @@ def test_the_papers_methods_add_nothing_to_it():
     assert (model.hash_levels, model.min_resolution, model.max_resolution) == (8, 128, 512)
     assert (model.features_per_level, model.log2_table_size) == (4, 19)
     assert (model.hidden_layers, model.layer_width) == (2, 256)
-
-
-def test_stage_2s_learning_rate_rises_evenly_and_falls_to_a_third_at_each_milestone():
-    config = WarmUpSchedulerConfig(warm_up=4, milestones=(6, 8), gamma=0.33)
-    optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=2.0)
-    schedule = config.setup().get_scheduler(optimizer, 2.0)
-    rates = []
-    for _ in range(10):
-        rates.append(optimizer.param_groups[0]["lr"])
-        optimizer.step()
-        schedule.step()
-    assert rates == pytest.approx([0.5, 1.0, 1.5, 2.0, 2.0, 2.0, 0.66, 0.66, 0.66 * 0.33, 0.66 * 0.33])

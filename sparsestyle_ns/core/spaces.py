@@ -6,7 +6,7 @@ the cube, so that the scale of the world's coordinates doesn't matter.
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Optional, Tuple, Union
 
 import torch
@@ -43,6 +43,15 @@ class Segments(ABC):
     def at_distance(self, distance: Float[Tensor, "rays 1"]) -> Float[Tensor, "rays 1"]:
         """s at a distance from the ray's origin in world units: the inverse of `distance`, cut to [0, 1]."""
 
+    def between(self, near: Float[Tensor, "rays 1"], far: Float[Tensor, "rays 1"]) -> "Segments":
+        """The parts that lie between two distances in world units; rays that have nothing there don't hit."""
+        start, end = self.at_distance(near), self.at_distance(far)
+        return self._part(start, torch.maximum(start, end), self.hit & (end > start).squeeze(-1))
+
+    @abstractmethod
+    def _part(self, start: Float[Tensor, "rays 1"], end: Float[Tensor, "rays 1"], hit: Tensor) -> "Segments":
+        """The parts from one s to another."""
+
 
 @dataclass
 class LinearSegments(Segments):
@@ -59,6 +68,10 @@ class LinearSegments(Segments):
     def lengths(self, edges: Tensor) -> Tensor:
         """See `Segments.lengths`."""
         return (edges[:, 1:] - edges[:, :-1]) * self.extent.norm(dim=-1, keepdim=True)
+
+    def _line(self, start: Tensor, end: Tensor, hit: Tensor) -> Tuple[Tensor, Tensor, Tensor]:
+        """Start, extent and hit of a part."""
+        return self.start + start * self.extent, (end - start) * self.extent * hit[:, None], hit
 
 
 @dataclass
@@ -80,6 +93,11 @@ class _ForwardFacingSegments(LinearSegments):
         t_ndc = ndc_parameter(distance, self.origins, self.directions, self.near)
         return _position_between(t_ndc, self.first, self.last)
 
+    def _part(self, start: Tensor, end: Tensor, hit: Tensor) -> "_ForwardFacingSegments":
+        first, last = (torch.lerp(self.first, self.last, s) for s in (start, end))
+        line = self._line(start, end, hit)
+        return _ForwardFacingSegments(*line, self.origins, self.directions, self.near, first, last)
+
 
 @dataclass
 class _BoxSegments(LinearSegments):
@@ -96,6 +114,10 @@ class _BoxSegments(LinearSegments):
     def at_distance(self, distance: Tensor) -> Tensor:
         return _position_between(distance, self.near, self.far)
 
+    def _part(self, start: Tensor, end: Tensor, hit: Tensor) -> "_BoxSegments":
+        near, far = (torch.lerp(self.near, self.far, s) for s in (start, end))
+        return _BoxSegments(*self._line(start, end, hit), near, far, self.beyond)
+
 
 @dataclass
 class ContractedSegments(Segments):
@@ -106,17 +128,25 @@ class ContractedSegments(Segments):
     near: float
     unit: float
     hit: Bool[Tensor, "rays"]
+    ends: Optional[Tuple[Float[Tensor, "rays 1"], Float[Tensor, "rays 1"]]] = None
+    """Where each ray starts and ends, by `spacing`; None: from `near` to `MAX_DISTANCE`."""
 
     def distance(self, s: Tensor) -> Tensor:
         """See `Segments.distance`."""
         return self.unit * self._distance_in_units(s)
 
-    def _distance_in_units(self, s: Tensor) -> Tensor:
+    def _distance_in_units(self, s: Tensor, ray_indices: Optional[Tensor] = None) -> Tensor:
         start, end = self._ends(s)
+        if self.ends is not None and ray_indices is not None:
+            start, end = start[ray_indices, 0], end[ray_indices, 0]
         return inverse_spacing(start + s * (end - start))
 
     def _ends(self, like: Tensor) -> Tuple[Tensor, Tensor]:
-        return spacing(like.new_tensor(self.near)), spacing(like.new_tensor(MAX_DISTANCE))
+        return self.ends or (spacing(like.new_tensor(self.near)), spacing(like.new_tensor(MAX_DISTANCE)))
+
+    def _part(self, start: Tensor, end: Tensor, hit: Tensor) -> "ContractedSegments":
+        first, last = self._ends(start)
+        return replace(self, hit=hit, ends=tuple(first + s * (last - first) for s in (start, end)))
 
     def at_distance(self, distance: Tensor) -> Tensor:
         """See `Segments.at_distance`."""
@@ -124,7 +154,8 @@ class ContractedSegments(Segments):
 
     def positions(self, s: Tensor, ray_indices: Optional[Tensor] = None) -> Tensor:
         """See `Segments.positions`."""
-        return contract(_points(self.origins, self.directions, self._distance_in_units(s), ray_indices))
+        distance = self._distance_in_units(s, ray_indices)
+        return contract(_points(self.origins, self.directions, distance, ray_indices))
 
     def lengths(self, edges: Tensor) -> Tensor:
         """See `Segments.lengths`; chords of the bent ray."""

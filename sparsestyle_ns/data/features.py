@@ -1,11 +1,13 @@
 """SIFT features of photos (Lowe 2004), which features of two photos look alike, and which photos that links."""
 
 from dataclasses import dataclass
-from typing import Iterable, List, Set, Tuple
+from typing import Any, Callable, Iterable, List, Set, Tuple, TypeVar, Union
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+
+T = TypeVar("T")
 
 
 @dataclass
@@ -28,6 +30,17 @@ def find_features(grey: UInt8[np.ndarray, "H W"], count: int, min_contrast: floa
     # Square roots of the L1-normalised descriptor: Hellinger's distance (Arandjelović and Zisserman 2012).
     descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
     return Features(np.array([keypoint.pt for keypoint in keypoints]), descriptors)
+
+
+def estimated(estimator: Callable[..., T], *matches: Any, **settings: Any) -> Union[T, Tuple[None, None]]:
+    """What an estimator of OpenCV's finds: a model, and which matches agree with it; None and None where it gives up.
+
+    It gives up on degenerate matches, such as many of one point, in an assertion of its own.
+    """
+    try:
+        return estimator(*matches, **settings)
+    except cv2.error:
+        return None, None
 
 
 def linked_groups(count: int, links: Iterable[Tuple[int, int]]) -> List[Set[int]]:

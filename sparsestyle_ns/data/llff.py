@@ -114,7 +114,7 @@ class LLFFDataParser(DataParser):
             raise InputError(f"--eval-interval {interval} would leave no image to train on: give 2 or more.")
         if not 0 < scale < math.inf:
             raise InputError(f"--bound-scale {scale} is no scale: give a number above 0, such as 0.75.")
-        if factor is not None and factor < 1:
+        if factor is not None and (factor < 1 or factor != int(factor)):  # ns-render has it as 2.0
             raise InputError(f"--downscale-factor {factor} names no folder: give N for images_N, 1 for images.")
 
     def _view_ids(self, split: str, num_views: int) -> List[int]:
@@ -138,12 +138,13 @@ def read_poses_bounds(folder: Path) -> LLFFCameras:
         InputError: if the file is missing, is not an array of N rows of 17 numbers, or a row describes no camera.
     """
     if not folder.is_dir():
-        raise InputError(f"There is no folder {folder}: give an LLFF folder with --data.")
+        raise InputError(f"There is no folder {folder}", "give an LLFF folder with --data")
     path = folder / "poses_bounds.npy"
     if not path.exists():
         raise InputError(
             f"{folder} has no poses_bounds.npy: an LLFF folder needs that file (LLFF's imgs2poses.py writes it) "
-            f"and one of images_8, images_4, images{advice(folder, path.name)}."
+            "and one of images_8, images_4, images",
+            advice(folder, path.name),
         )
     rows = _load_rows(path)
     down, right, back, position, size = rows[:, :15].reshape(-1, 3, 5).unbind(-1)
@@ -204,17 +205,17 @@ def _find_images(folder: Path, downscale_factor: Optional[int], num_poses: int) 
     """Sorted image files of the folder that `downscale_factor` names, one for each pose."""
     names = ["images_8", "images_4", "images"]
     if downscale_factor is not None:
-        names = ["images" if downscale_factor == 1 else f"images_{downscale_factor}"]
+        names = ["images" if downscale_factor == 1 else f"images_{int(downscale_factor)}"]
     image_folder = next((folder / name for name in names if (folder / name).is_dir()), None)
     if image_folder is None:
         there = sorted(path.name for path in folder.glob("images*") if path.is_dir())
         advice = f"choose from {', '.join(there)} with --downscale-factor" if there else "put the photos into images"
-        raise InputError(f"{folder} has no folder {' or '.join(names)}: {advice}.")
+        raise InputError(f"{folder} has no folder {' or '.join(names)}", advice)
     filenames = images_in(image_folder, (".jpg", ".jpeg", ".png"))
     if not filenames:
         raise InputError(
-            f"{image_folder} has no .jpg, .jpeg or .png image: put the photos there, "
-            "or choose another folder with --downscale-factor."
+            f"{image_folder} has no .jpg, .jpeg or .png image",
+            "put the photos there, or choose another folder with --downscale-factor",
         )
     if len(filenames) != num_poses:
         raise InputError(

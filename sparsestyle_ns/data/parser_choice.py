@@ -21,11 +21,11 @@ def _marker_of(folder: Path) -> Optional[str]:
 
 
 def advice(folder: Path, missing: str) -> str:
-    """The end of an error message about a missing file: a semicolon and which dataparser to name instead, if any."""
+    """What to do about a missing file: which dataparser to name instead, if there is one that reads the folder."""
     marker = _marker_of(folder)
     if marker in (None, missing):
         return ""
-    return f"; it has {marker}, which {MARKERS[marker]} reads: put {MARKERS[marker]} at the end of the command"
+    return f"it has {marker}, which {MARKERS[marker]} reads: put {MARKERS[marker]} at the end of the command"
 
 
 def parse_dataparser(words: Sequence[str], data: Path) -> DataParserConfig:
@@ -47,8 +47,7 @@ def parse_dataparser(words: Sequence[str], data: Path) -> DataParserConfig:
     if not words:
         marker = _marker_of(data)
         if marker is None:
-            raise InputError(
-                f"{data} has none of {', '.join(MARKERS)}, so the dataparser isn't known; name it last, such as colmap."
-            )
+            unknown = f"{data} has none of {', '.join(MARKERS)}, so the dataparser isn't known"
+            raise InputError(unknown, "name it last, such as colmap")
         words = [MARKERS[marker]]
     return tyro.cli(AnnotatedDataParserUnion, args=list(words), prog="sparsestyle")

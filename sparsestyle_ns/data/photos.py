@@ -3,17 +3,21 @@
 import copy
 from collections import Counter
 from pathlib import Path
-from typing import Any, Dict, List, Literal, Sequence, Tuple
+from typing import Any, Dict, List, Literal, Optional, Sequence, Tuple
 
 import numpy as np
+import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from torch import Tensor
 
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import digest
+from sparsestyle_ns.utils.pictures import read_mask
 
 IMAGE_MODES = ("L", "RGB", "RGBA")
 """Pillow's names of the pixel formats that are read as they are meant."""
@@ -55,6 +59,19 @@ def open_photo(path: Path, draft: bool = False) -> Image.Image:
     return image
 
 
+def photo_digests(outputs: DataparserOutputs) -> List[Optional[str]]:
+    """The `digest` of each view's photo, with its mask where it has one; None where that can't be read."""
+
+    def of_files(*paths: Optional[Path]) -> Optional[str]:
+        try:
+            return digest(*(path.read_bytes() for path in paths if path is not None))
+        except OSError:
+            return None
+
+    masks = outputs.mask_filenames or [None] * len(outputs.image_filenames)
+    return list(map(of_files, outputs.image_filenames, masks))
+
+
 def photo_size(path: Path) -> Tuple[int, int]:
     """Width and height in pixels, from the file's header alone; an `InputError` if there is none."""
     try:
@@ -62,6 +79,20 @@ def photo_size(path: Path) -> Tuple[int, int]:
             return image.size
     except Exception:
         return open_photo(path).size  # says what is wrong with it
+
+
+def has_opacity(path: Path) -> bool:
+    """Whether a photo's pixels have an opacity, by its header alone; False where there is none."""
+    try:
+        with Image.open(path) as image:
+            return image.mode == "RGBA"
+    except Exception:
+        return False
+
+
+def is_transparent(path: Path) -> bool:
+    """Whether any pixel of a photo isn't opaque."""
+    return has_opacity(path) and open_photo(path).getchannel("A").getextrema()[0] < 255
 
 
 def check_one_size(filenames: Sequence[Path]) -> None:
@@ -106,14 +137,14 @@ def _check_content(path: Path, pixels: UInt8[np.ndarray, "H W channels"]) -> Non
     height, width, channels = pixels.shape
     if min(height, width) < SMALLEST_SIDE:
         raise InputError(
-            f"{path} is {width}x{height} pixels, but at least {SMALLEST_SIDE} a side are needed: replace it, or choose "
-            "other views with --view-ids."
+            f"{path} is {width}x{height} pixels, but at least {SMALLEST_SIDE} a side are needed: replace it, or take "
+            "it and its pose out of the scene."
         )
     opaque = channels == 3 or pixels[..., 3].min() == 255
     nothing = pixels[..., :3].max() <= DARKEST if opaque else pixels[..., 3].max() == 0
     if nothing:
         kind = "black" if opaque else "transparent"
-        raise InputError(f"{path} is {kind} all over: replace it, or choose other views with --view-ids.")
+        raise InputError(f"{path} is {kind} all over: replace it, or take it and its pose out of the scene.")
 
 
 class PhotoDataset(InputDataset):
@@ -137,15 +168,30 @@ class PhotoDataset(InputDataset):
         return np.array(image if image.size == size else image.resize(size, resample=Image.Resampling.BILINEAR))
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> Dict[str, Any]:
-        """nerfstudio's dictionary of a photo and, where there is one, its mask."""
+        """nerfstudio's dictionary of a photo and, where there is one, its mask, which nerfstudio would misread."""
+        image = self.get_image_uint8(image_idx) if image_type == "uint8" else self.get_image_float32(image_idx)
+        data: Dict[str, Any] = {"image_idx": image_idx, "image": image}
+        masks = self._dataparser_outputs.mask_filenames
+        if masks is not None:
+            data["mask"] = torch.from_numpy(self._read_mask(masks[image_idx], image_idx))[..., None]
+            if self.mask_color:
+                data["image"] = torch.where(data["mask"], image, image.new_tensor(self.mask_color))
+        return data
+
+    def _read_mask(self, mask: Path, image_idx: int) -> Bool[np.ndarray, "H W"]:
+        """Which pixels of a photo, at the size of its camera, a mask leaves in."""
+        photo = self.image_filenames[image_idx]
         try:
-            return super().get_data(image_idx, image_type)
-        except InputError:
-            raise
-        except Exception as error:  # nerfstudio's reader of masks names neither the file nor what is wrong
-            if self._dataparser_outputs.mask_filenames is None:
-                raise
-            mask = self._dataparser_outputs.mask_filenames[image_idx]
+            inside = read_mask(mask.read_bytes())
+        except Exception as error:  # decoders meet a damaged file with errors of many kinds
+            raise InputError(f"The mask {mask} doesn't fit {photo}, as it can't be read: replace it.") from error
+        width, height = photo_size(photo)
+        if inside.shape != (height, width):
             raise InputError(
-                f"The mask {mask} doesn't fit {self.image_filenames[image_idx]} or can't be read: replace it."
-            ) from error
+                f"The mask {mask} doesn't fit {photo}: it is {inside.shape[1]}x{inside.shape[0]} pixels, and the photo "
+                f"{width}x{height}; scale it to that size."
+            )
+        if not inside.any():
+            raise InputError(f"The mask {mask} leaves nothing of {photo} in: replace it, or take out both.")
+        size = int(self.cameras.width[image_idx]), int(self.cameras.height[image_idx])
+        return np.array(Image.fromarray(inside).resize(size, resample=Image.Resampling.NEAREST))

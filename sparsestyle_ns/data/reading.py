@@ -10,10 +10,12 @@ import numpy as np
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from sparsestyle_ns.data.colmap import read_colmap
 from sparsestyle_ns.data.parser_choice import advice
-from sparsestyle_ns.data.photos import open_photo
+from sparsestyle_ns.data.photos import has_opacity, open_photo
 from sparsestyle_ns.data.scene_info import SCENE_INFO, SceneInfo
 from sparsestyle_ns.data.view_selection import BLENDER_VIEWS
 from sparsestyle_ns.utils.errors import InputError
@@ -43,7 +45,8 @@ def read_scene(parser: DataParser, split: str = "train") -> DataparserOutputs:
         is_file = config.data.suffix == ".json"
         read_transforms(config.data if is_file else config.data / "transforms.json", with_angle=False)
     try:
-        outputs = parser.get_dataparser_outputs(split)
+        is_colmap = isinstance(config, ColmapDataParserConfig)
+        outputs = read_colmap(parser, split) if is_colmap else parser.get_dataparser_outputs(split)
     except InputError:
         raise
     except Exception as error:  # a file that isn't as a parser expects it shows itself in any kind of error
@@ -54,6 +57,8 @@ def read_scene(parser: DataParser, split: str = "train") -> DataparserOutputs:
             "its files, or choose the dataparser that they were made for."
         ) from error
     _check_cameras(outputs)
+    if outputs.alpha_color is None and any(map(has_opacity, outputs.image_filenames)):
+        outputs = replace(outputs, alpha_color=torch.ones(3))  # else the colours that nobody sees would be trained on
     if SCENE_INFO in outputs.metadata:
         return outputs
     standard_views = BLENDER_VIEWS if isinstance(config, BlenderDataParserConfig) else None
@@ -135,8 +140,7 @@ def _read(path: Path) -> Dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         where = f"{path.parent} has no {path.name}" if path.parent.is_dir() else f"There is no folder {path.parent}"
-        what = advice(path.parent, path.name) or "; name the folder of a scene with --data"
-        raise InputError(f"{where}{what}.") from error
+        raise InputError(where, advice(path.parent, path.name) or "name the folder of a scene with --data") from error
     except (OSError, ValueError, RecursionError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
         raise InputError(f"{path} can't be read as JSON ({error}): export the scene again.") from error
     if not isinstance(content, dict):

@@ -11,6 +11,8 @@ from nerfstudio.engine.trainer import TrainerConfig
 from sparsestyle_ns.effects.decisions import EffectSettings
 from sparsestyle_ns.runs.coarse_run import read_coarse_run
 from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD
+from sparsestyle_ns.runs.scene_record import SceneRecord
+from sparsestyle_ns.utils.files import free_path
 from sparsestyle_ns.utils.progress import say
 
 PAINTING = "PAINTING.jpg"
@@ -32,14 +34,21 @@ def ns_train_style(coarse_run: Path, config: TrainerConfig) -> List[str]:
 
 def after_evaluation(run: Path, stylised: bool) -> List[str]:
     """What follows on the measuring of a run, stylised or coarse, given by its folder."""
-    return ["sparsestyle", "gallery", str(run)] if stylised else ns_train_style(run, read_coarse_run(run).config)
+    if stylised:
+        return ["sparsestyle", "gallery", str(run)]
+    config = read_coarse_run(run).config
+    if config.get_base_dir().resolve() != run.resolve():  # it has moved, and its scene perhaps, too
+        config.output_dir = Path("outputs")
+        config.pipeline.datamanager.data = SceneRecord.load(run).find_data(run.resolve())
+    return ns_train_style(run, config)
 
 
 def after_export(run: Path, output_path: Path, format: str) -> List[object]:
     """What follows on an export: a look at a page; of a file of points or triangles, that page."""
     if format == "html":
         return ["python", "-m", "webbrowser", output_path.resolve().as_uri()]
-    return ["sparsestyle", "export", run, "--format", "html", "--output-path", output_path.with_suffix(".html")]
+    page = free_path(output_path.with_suffix(".html"))
+    return ["sparsestyle", "export", run, "--format", "html", "--output-path", page]
 
 
 def scene_arguments(config: TrainerConfig) -> List[str]:
@@ -82,6 +91,10 @@ def flags_of(name: str, value: Any, usual: Any = None) -> List[str]:
 def resume_command(method: str, checkpoints: Path, typed: Optional[Sequence[str]] = None) -> List[str]:
     """The command that trains a method on from a folder of checkpoints, otherwise as it was `typed` (None: here)."""
     typed = sys.argv[1:] if typed is None else list(typed)
+    if any(part.split("=")[0].replace("_", "-") == "--load-config" for part in typed):  # with which no flag counts
+        return ["ns-train", method, "--load-config", str(checkpoints.parent / "config.yml")]
+    if any(part.split("=")[0].replace("_", "-") == "--load-config" for part in typed):  # with which no flag counts
+        return ["ns-train", method, "--load-config", str(checkpoints.parent / "config.yml")]
     if method not in typed:  # training was begun by something else than ns-train
         return ["ns-train", method, "--load-dir", str(checkpoints)]
     before, after = typed[: typed.index(method)], typed[typed.index(method) + 1 :]

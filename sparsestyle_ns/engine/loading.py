@@ -9,11 +9,9 @@ from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.evaluation.held_out import HeldOutReport
 from sparsestyle_ns.evaluation.tables import report_tables
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
-from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.runs.checkpoints import checkpoint_path
 from sparsestyle_ns.runs.run_folder import find_config
-from sparsestyle_ns.runs.scene_record import SceneRecord
 from sparsestyle_ns.style.painting import Painting
-from sparsestyle_ns.utils.errors import InputError
 
 
 class LoadedRun(NamedTuple):
@@ -23,27 +21,21 @@ class LoadedRun(NamedTuple):
     pipeline: CheckedPipeline
     step: int
 
+    def save_report(self, report: HeldOutReport, path: Path) -> None:
+        """Writes what was measured of the run; OSError where that can't be."""
+        checkpoint = checkpoint_path(self.config.get_checkpoint_dir(), self.step)
+        report.save(path, self.config.experiment_name, self.config.method_name, self.step, checkpoint)
+
 
 def load_run(config_path: Path) -> LoadedRun:
-    """Loads a run by its config.yml, wherever it is now; InputError where it has no checkpoint."""
+    """Loads a run by its config.yml, wherever it is now; InputError as in `RunConfig.open_in`."""
     from nerfstudio.utils.eval_utils import eval_setup  # nerfstudio's own circle: it imports all methods
 
-    folder = config_path.resolve().parent
-
-    def where_it_is_now(config: SparseStyleTrainerConfig) -> SparseStyleTrainerConfig:
-        newest = newest_checkpoint(folder / config.relative_model_dir)
-        if newest is None:
-            raise InputError(f"{folder} has no checkpoint yet; train it, or name another run.")
-        config.load_step = checkpoint_step(newest)
-        # nerfstudio joins these four to find the checkpoints, from the folder that the command was started in.
-        config.output_dir, config.experiment_name = folder.parents[2], folder.parents[1].name
-        config.method_name, config.timestamp = folder.parent.name, folder.name
-        data = config.pipeline.datamanager.data
-        if data is not None and not data.exists():
-            config.pipeline.datamanager.data = Path(SceneRecord.load(folder).data)
+    def opened(config: SparseStyleTrainerConfig) -> SparseStyleTrainerConfig:
+        config.open_in(config_path.resolve().parent)
         return config
 
-    config, pipeline, _, step = eval_setup(config_path, test_mode="test", update_config_callback=where_it_is_now)
+    config, pipeline, _, step = eval_setup(config_path, test_mode="test", update_config_callback=opened)
     return LoadedRun(config, pipeline, step)
 
 
@@ -52,17 +44,22 @@ def evaluate(options: EvaluateOptions) -> None:
     if options.style_image is not None:
         Painting.read(options.style_image)
     config = find_config(options.run)
-    report = evaluate_run(config, options.output_path, options.style_image, options.baked)
+    report = evaluate_run(config, options.output_path, options.style_image, options.baked, options.vgg_weights)
     for table in report_tables(report.means, len(report.views)):
         table.print()
     finish(options.output_path, after_evaluation(config.parent, stylised="content_ssim" in report.means))
 
 
 def evaluate_run(
-    config_path: Path, output_path: Path, style_image: Optional[Path] = None, baked: bool = False
+    config_path: Path,
+    output_path: Path,
+    style_image: Optional[Path] = None,
+    baked: bool = False,
+    vgg_weights: Optional[Path] = None,
 ) -> HeldOutReport:
     """Loads a run and writes its `CheckedPipeline.held_out_report`; InputError where it has no checkpoint."""
-    config, pipeline, step = load_run(config_path)
-    report = pipeline.held_out_report(style_image, baked)
-    report.save(output_path, config.experiment_name, config.method_name, step)
+    run = load_run(config_path)
+    run.pipeline.config.vgg_weights = vgg_weights or run.pipeline.config.vgg_weights
+    report = run.pipeline.held_out_report(style_image, baked)
+    run.save_report(report, output_path)
     return report

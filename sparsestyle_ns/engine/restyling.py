@@ -18,13 +18,14 @@ import yaml
 from torch import Tensor, nn
 
 from sparsestyle_ns.effects.registry import decide_again
+from sparsestyle_ns.engine.schedules import over_iterations
 from sparsestyle_ns.engine.style_trainer import style_notes
-from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
+from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig, run_notes
 from sparsestyle_ns.engine.training import check_skipped, training_step, warm_start
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleTask
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path, write_checkpoint
 from sparsestyle_ns.runs.run_folder import read_config
-from sparsestyle_ns.runs.scene_record import RECORD_FILE, save_thumbnail
+from sparsestyle_ns.runs.scene_record import SceneRecord, save_thumbnail
 from sparsestyle_ns.style.backbone import Backbone
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.distributed import num_processes
@@ -79,18 +80,23 @@ class Workshop:
 class Restyling:
     """One restyling, in steps: `for progress in restyling: …`, then `field` (σ_f and c_f) is the new style.
 
-    Without a number of iterations, as many as the run had; InputError for less than 1.
+    Without a number of iterations, as many as the run had, and without a size of strokes, the run's; InputError for
+    less than one iteration.
     """
 
-    def __init__(self, workshop: Workshop, image: Painting, iterations: Optional[int] = None) -> None:
+    def __init__(
+        self, workshop: Workshop, image: Painting, iterations: Optional[int] = None, stroke_size: Optional[float] = None
+    ) -> None:
         self.workshop, self.pipeline, self.image = workshop, workshop.pipeline, image
         self.config: SparseStyleTrainerConfig = read_config(workshop.folder)  # as it is by now
         self.iterations = self.config.max_num_iterations if iterations is None else iterations
+        self.stroke_size = self.config.pipeline.stroke_size if stroke_size is None else stroke_size
         if self.iterations < 1:
             raise InputError(f"A style needs at least 1 iteration, and {self.iterations} were asked for.")
         self._painting = Path(PAINTING_FOLDER) / safe_file_name(self.image.name, "painting")
         self.field = workshop.new_field()
-        self.optimizers = FiniteOptimizers(self.config.optimizers.copy(), {"fields": list(self.field.parameters())})
+        optimizers = over_iterations(self.config.optimizers, self.iterations)
+        self.optimizers = FiniteOptimizers(optimizers, {"fields": list(self.field.parameters())})
 
     def __iter__(self) -> Iterator[Progress]:
         yield Progress(f"Looking at {self.image.name}")
@@ -99,7 +105,8 @@ class Restyling:
         self.effects = decide_again(pipeline.effects, "palette", scene)  # what depends on the painting
         if pipeline.scene_views is None:
             yield Progress("Preparing the views, which the next style won't need")
-        task = pipeline.new_task(self.field, self.image, self.workshop.backbone, self.effects, total)
+        of_style = self.field, self.image, self.workshop.backbone, self.effects
+        task = pipeline.new_task(*of_style, total, self.stroke_size)
         warm_up = pipeline.config.warm_start_steps
         for step in warm_start(pipeline, task, self.optimizers):
             yield Progress(f"Warm start, step {step + 1} of {warm_up}", (step + 1) / (warm_up + total))
@@ -138,8 +145,11 @@ class Restyling:
             config = copy.deepcopy(self.config)
             config.timestamp, config.max_num_iterations = folder.name, self.iterations
             config.load_dir = config.load_step = config.load_checkpoint = None
+            config.pipeline.stroke_size = self.stroke_size
             config.pipeline.style_image, config.pipeline.decided = folder.resolve() / self._painting, self.effects
             write_whole(new / "config.yml", yaml.dump(config))
+            if (record := self._record()) is not None:
+                record.save(new, folder)
             return new.rename(folder)
         finally:
             shutil.rmtree(hidden, ignore_errors=True)
@@ -148,9 +158,9 @@ class Restyling:
         """Writes a run but for its config."""
         write_whole(new / self._painting, self.image.data)
         save_thumbnail(new, self.image)
-        for name in (RECORD_FILE, "dataparser_transforms.json"):  # what says nothing of the style
-            if (self.workshop.folder / name).is_file():
-                shutil.copy(self.workshop.folder / name, new / name)
+        transforms = self.workshop.folder / "dataparser_transforms.json"
+        if transforms.is_file():
+            shutil.copy(transforms, new / transforms.name)
         self.effects.save(new)
         own = {f"_model.residual.{name}": value for name, value in self.field.state_dict().items()}
         path = checkpoint_path(new / self.config.relative_model_dir, self.iterations - 1)
@@ -159,4 +169,12 @@ class Restyling:
 
     def notes(self) -> CheckpointNotes:
         """What its checkpoint says beside the state."""
-        return style_notes(self.pipeline, self.effects, asdict(self.workshop.backbone.description))
+        notes = run_notes(self.effects, self._record())
+        return style_notes(self.pipeline, notes, asdict(self.workshop.backbone.description))
+
+    def _record(self) -> Optional[SceneRecord]:
+        """What is known of the scene, with this painting."""
+        try:
+            return replace(SceneRecord.load(self.workshop.folder), painting=self.image.digest)
+        except InputError:
+            return None

@@ -23,9 +23,10 @@ from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipe
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes
 from sparsestyle_ns.runs.coarse_run import CoarseRun, check_scene, find_coarse_run, read_coarse_run
 from sparsestyle_ns.runs.run_folder import COARSE_METHOD
-from sparsestyle_ns.runs.scene_record import record_scene, save_thumbnail
+from sparsestyle_ns.runs.scene_record import SceneRecord, save_thumbnail
 from sparsestyle_ns.utils.distributed import from_first_process
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
+from sparsestyle_ns.utils.interrupts import stop
 from sparsestyle_ns.utils.machine import release_memory
 from sparsestyle_ns.utils.progress import bar
 
@@ -35,10 +36,10 @@ RUN_SETTINGS = ("data", "output_dir", "experiment_name", "project_name", "machin
 """Of the trainer: the same."""
 
 
-def style_notes(pipeline: HierStylePipeline, effects: Decisions, backbone: Dict[str, str]) -> CheckpointNotes:
-    """The notes of a checkpoint of a scene in a style that is made with these effects and this network."""
+def style_notes(pipeline: HierStylePipeline, notes: CheckpointNotes, backbone: Dict[str, str]) -> CheckpointNotes:
+    """The notes of a checkpoint with what a style that is made with this network has beside those of every run."""
     return {
-        "effects": effects.records(),
+        **notes,
         "backbone": backbone,
         "coarse_run": str(pipeline.config.coarse_run),
         "coarse_field": asdict(pipeline.config.model.coarse_field),
@@ -81,6 +82,7 @@ class HierStyleTrainer(SparseStyleTrainer):
         pipeline.backbone = self._description["name"]
         if before.get("backbone", {}).get("sha256") == self._description["sha256"]:
             self._description = before["backbone"]
+        self._check_painting(before)
         if self.resumed is None:
             self._begin(pipeline)
         self.config = replace(self.config, pipeline=pipeline)
@@ -92,6 +94,19 @@ class HierStyleTrainer(SparseStyleTrainer):
             with bar("Warm start", pipeline.warm_start_steps) as warming:
                 for _ in warm_start(self.pipeline, self.pipeline.task, self.optimizers):
                     warming.advance()
+
+    def _check_painting(self, before: CheckpointNotes) -> None:
+        """Raises an InputError where a run would go on with another painting."""
+        made_for = before.get("scene", {}).get("painting")
+        if made_for not in (None, self._painting.digest):
+            raise InputError(
+                f"The style image {self._painting.name} isn't the one that the checkpoint "
+                f"{self.config.resumed_checkpoint()} was made with; name that one, or begin anew."
+            )
+
+    def completed(self, record: SceneRecord) -> SceneRecord:
+        """With the painting."""
+        return replace(record, painting=self._painting.digest)
 
     def _begin(self, pipeline: HierStylePipelineConfig) -> None:
         """Finds the coarse run of a new run, and decides what is simulated: as there, the rest by its field."""
@@ -112,7 +127,7 @@ class HierStyleTrainer(SparseStyleTrainer):
 
     def notes(self) -> CheckpointNotes:
         """See `style_notes`."""
-        return style_notes(self.pipeline, self.pipeline.effects, self._description)
+        return style_notes(self.pipeline, super().notes(), self._description)
 
     def _load_checkpoint(self) -> None:
         super()._load_checkpoint()
@@ -122,7 +137,7 @@ class HierStyleTrainer(SparseStyleTrainer):
 
     def _find_coarse(self, manager: FewShotDataManager, decided: Decisions) -> CoarseRun:
         """The coarse run that was asked for, else the newest that fits, else a new one, trained here and now."""
-        scene = record_scene(manager.config.data, manager.train_dataparser_outputs, decided)
+        scene = manager.record(decided)
         asked = self.config.pipeline.coarse_run
         if asked is not None:
             run = read_coarse_run(asked)
@@ -156,8 +171,10 @@ class HierStyleTrainer(SparseStyleTrainer):
         trainer = config.setup(local_rank=self.local_rank, world_size=self.world_size)
         trainer.setup()
         if not trainer.train_to_end():
+            if trainer.step + 1 == config.max_num_iterations:
+                stop("Stopped by Ctrl-C; the coarse run is finished, and this command, run again, stylises it.")
             resume = ["ns-train", config.method_name, "--load-dir", str(trainer.checkpoint_dir)]
-            raise InputError(
+            stop(
                 "The coarse run was interrupted, so there is nothing to stylise yet; finish it with "
                 f"{shlex.join([*resume, *scene_arguments(config)])} and run this command again."
             )

@@ -1,7 +1,9 @@
 """nerfstudio's trainer, made to keep what it has: whole checkpoints, also on Ctrl-C, and resuming where it stopped."""
 
 import functools
+import os
 import signal
+import time
 import warnings
 from abc import ABC, abstractmethod
 from contextlib import ExitStack
@@ -11,9 +13,8 @@ from types import FrameType
 from typing import Any, ClassVar, Dict, List, Literal, Optional, Tuple, Type
 
 import torch
-import yaml
 from nerfstudio.configs.base_config import MachineConfig
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import comms, writer
 from nerfstudio.utils.decorators import check_main_thread, check_viewer_enabled
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -22,20 +23,26 @@ from torch import Tensor
 from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.engine.hints import finish, ns_train_style, resume_command
 from sparsestyle_ns.engine.previews import preview_steps, write_preview
+from sparsestyle_ns.engine.run_config import RunConfig
+from sparsestyle_ns.engine.schedules import over_iterations
 from sparsestyle_ns.engine.training import check_skipped, training_step
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.runs import checkpoints
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path
-from sparsestyle_ns.runs.scene_record import record_scene
+from sparsestyle_ns.runs.run_folder import remove_empty_run
+from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord, record_scene
 from sparsestyle_ns.utils.distributed import any_process, prepare_launch, share_state
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
-from sparsestyle_ns.utils.files import write_whole
-from sparsestyle_ns.utils.progress import bar
+from sparsestyle_ns.utils.interrupts import StoppedByCtrlC, stop, take_away_at_end
+from sparsestyle_ns.utils.progress import bar, say
 from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 
 STEPS_PER_LOOK = 10
 """Iterations between looks at the count of skipped steps, each of which waits for a GPU."""
+
+SECONDS_OF_ONE_PRESS = 1.0
+"""Ctrl-C that comes again within so long is the same one: pressed twice, or passed on by the process above."""
 
 warnings.filterwarnings("ignore", message="Using a non-tuple sequence", module="nerfstudio")
 warnings.filterwarnings("ignore", message="Sparse invariant checks are implicitly disabled")
@@ -47,7 +54,7 @@ def this_machine() -> MachineConfig:
 
 
 @dataclass
-class SparseStyleTrainerConfig(TrainerConfig):
+class SparseStyleTrainerConfig(RunConfig):
     """Settings of a run of either method."""
 
     _target: Type = field(default_factory=lambda: SparseStyleTrainer)
@@ -64,21 +71,27 @@ class SparseStyleTrainerConfig(TrainerConfig):
 
     @exit_on_input_error
     def save_config(self) -> None:
-        """Writes config.yml into the run's folder; `ns-train` calls it right before it starts processes."""
-        machine, folder, gpus = self.machine, self.get_base_dir(), torch.cuda.device_count()
+        """Finds the run its folder, and writes config.yml there; `ns-train` calls it before it starts processes."""
+        machine, gpus = self.machine, torch.cuda.device_count()
         if machine.device_type == "cuda" and machine.num_devices > gpus:
             advice = "ask for fewer." if gpus else "give --machine.device-type cpu."
             raise InputError(
                 f"--machine.device-type is cuda and --machine.num-devices {machine.num_devices}, but torch finds "
                 f"{gpus or 'no'} GPU{'s' * (gpus > 1)} here; {advice}"
             )
+        is_new = self.find_place()
         if machine.num_devices * machine.num_machines > 1:
             prepare_launch()
-        try:
-            write_whole(folder / "config.yml", yaml.dump(self))
-        except OSError as error:
-            where = f"{folder} ({error.strerror}); name a folder that can be written to with --output-dir."
-            raise InputError(f"The run can't be saved in {where}") from error
+        folder = self.get_base_dir()
+        if not folder.exists():
+            take_away_at_end(lambda: remove_empty_run(folder))
+        if is_new:  # what a run that is gone on with says stays until it is known that it can be
+            self.write_config()
+
+
+def run_notes(effects: Decisions, record: Optional[SceneRecord]) -> CheckpointNotes:
+    """What the checkpoint of every run says beside the state, as far as it is known."""
+    return {"effects": effects.records(), **({} if record is None else {"scene": asdict(record)})}
 
 
 class SparseStyleTrainer(Trainer, ABC):
@@ -98,46 +111,65 @@ class SparseStyleTrainer(Trainer, ABC):
         self._preview_steps = preview_steps(self.config.previews, self.config.max_num_iterations)
         self._reported = 0
         self._kept_step: Optional[int] = None
-        if self.resumed is not None and "effects" in self.resumed:
-            decided = Decisions.from_records(self.resumed["effects"])
-            decided.check_choices(self.config.pipeline.effects, f"the checkpoint {self._resumed_checkpoint()}")
-            self.config = replace(self.config, pipeline=replace(self.config.pipeline, decided=decided))
+        self._own_checkpoint: Optional[Path] = None
+        self.record: Optional[SceneRecord] = None
+        if self.resumed is not None:
+            self._expect_what_was(self.resumed)
+        if self.config.data is not None and not os.access(self.config.data, os.W_OK):
+            self.config = replace(self.config, data=None)  # where nerfstudio's viewer would make a folder
         super().setup(test_mode)
+        manager = self.pipeline.datamanager
+        manager.config.expected = None  # it is that scene
         if comms.is_main_process():
-            manager, effects = self.pipeline.datamanager, self.pipeline.effects
-            record_scene(manager.config.data, manager.train_dataparser_outputs, effects).save(self.base_dir)
+            parts = manager.train_dataparser_outputs, self.pipeline.effects, manager.measured_views()
+            self.record = self.completed(record_scene(manager.config.data, *parts))
+            self.record.save(self.base_dir)
             self._save_decisions()
+
+    def _expect_what_was(self, before: Dict[str, Any]) -> None:
+        """Takes from a checkpoint what training goes on with; InputError where the command line says something else."""
+        done, total = before["step"] + 1, self.config.max_num_iterations
+        if done >= total:
+            of = f"The checkpoint is of iteration {done}"
+            raise InputError(f"{of}, and --max-num-iterations is {total}; raise it to train on.")
+        self.config.pipeline.datamanager.expected = self._expected_scene()
+        if "effects" in before:
+            decided = Decisions.from_records(before["effects"])
+            decided.check_choices(self.config.pipeline.effects, f"the checkpoint {self.config.resumed_checkpoint()}")
+            self.config = replace(self.config, pipeline=replace(self.config.pipeline, decided=decided))
+
+    def completed(self, record: SceneRecord) -> SceneRecord:
+        """The record of the scene with what the method adds to it."""
+        return record
+
+    def _expected_scene(self) -> Optional[ExpectedScene]:
+        """What the scene was when the checkpoint that training goes on from was made; None where nothing says that."""
+        checkpoint = self.config.resumed_checkpoint()
+        if "scene" in self.resumed:
+            record = SceneRecord.from_content(self.resumed["scene"])
+        elif (checkpoint.parents[1] / RECORD_FILE).is_file():  # of an earlier version
+            record = SceneRecord.load(checkpoint.parents[1])
+        else:
+            return None
+        advice = "go on with the photos, views and settings of the dataparser that it was trained with, or begin anew"
+        return ExpectedScene(record, f"The checkpoint {checkpoint}", advice, measured=False)
 
     def setup_optimizers(self) -> FiniteOptimizers:
         """Optimisers that skip steps whose gradient isn't finite."""
-        return FiniteOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
+        optimizers = over_iterations(self.config.optimizers, self.config.max_num_iterations)
+        return FiniteOptimizers(optimizers, self.pipeline.get_param_groups())
 
     def _save_decisions(self) -> None:
         self.pipeline.effects.save(self.base_dir)
         self._saved_decisions = self.pipeline.effects
         decided = replace(self.config.pipeline, decided=self.pipeline.effects)
-        replace(self.config, pipeline=decided).save_config()
+        replace(self.config, pipeline=decided).write_config()
 
     @functools.cached_property
     def resumed(self) -> Optional[Dict[str, Any]]:
         """What is in the checkpoint that training goes on from, until it is loaded; None for a new run."""
-        checkpoint = self._resumed_checkpoint()
+        checkpoint = self.config.resumed_checkpoint()
         return None if checkpoint is None else checkpoints.load_checkpoint(checkpoint)
-
-    def _resumed_checkpoint(self) -> Optional[Path]:
-        for source in (self.config.load_dir, self.config.load_checkpoint):
-            if source is not None and not source.exists():
-                raise InputError(
-                    f"There is nothing to resume at {source}; name a folder of checkpoints or one of them."
-                )
-        folder, step = self.config.load_dir, self.config.load_step
-        if folder is None:
-            return self.config.load_checkpoint
-        checkpoint = checkpoints.newest_checkpoint(folder) if step is None else checkpoint_path(folder, step)
-        if checkpoint is None or not checkpoint.is_file():
-            what = "checkpoint" if step is None else f"checkpoint of iteration {step}"
-            raise InputError(f"There is no {what} in {folder}; name a run's nerfstudio_models folder.")
-        return checkpoint
 
     def _load_checkpoint(self) -> None:
         state = self.resumed
@@ -148,27 +180,27 @@ class SparseStyleTrainer(Trainer, ABC):
                 self.optimizers.load_schedulers(state["schedulers"])
             self.grad_scaler.load_state_dict(state["scalers"])
             self._start_step, self._kept_step = state["step"] + 1, state["step"]
-            CONSOLE.print(f"Going on from {self._resumed_checkpoint()}.", soft_wrap=True)
+            CONSOLE.print(f"Going on from {self.config.resumed_checkpoint()}.", soft_wrap=True)
         self.resumed = None
         share_state(self.pipeline.model)
 
     @exit_on_input_error
     def train(self) -> None:
-        """Trains, and says what was made and what to type next."""
+        """Trains, and says what was made and what to type next; after Ctrl-C it ends the process, with status 130."""
         self.train_to_end()
         self.finish()
+        if self._interrupted:
+            raise StoppedByCtrlC
 
     def train_to_end(self) -> bool:
         """Trains up to `max_num_iterations`, counted from the very first iteration, also when resuming.
 
         Ctrl-C ends training after the iteration that is under way and saves a checkpoint; a second one stops at once.
-        Returns whether training came to its end.
+        Returns whether nobody pressed it.
         """
         total = self.config.max_num_iterations
-        if self._start_step >= total:
-            done = f"The checkpoint is of iteration {self._start_step}"
-            raise InputError(f"{done}, and --max-num-iterations is {total}; raise it to train on.")
-        self._interrupted = False
+        self._interrupted = self._waits = False
+        self._interrupted_at: Optional[float] = None
         former = signal.signal(signal.SIGINT, self._on_interrupt)
         has_table = self.config.logging.local_writer.enable  # nerfstudio's, which would write over the bar
         shown = bar(self.stage, total, self._start_step, "iterations", visible=not has_table)
@@ -178,7 +210,7 @@ class SparseStyleTrainer(Trainer, ABC):
                 super().train()
         except TrainingInterruptedError:
             self.save_checkpoint(self.step)
-            CONSOLE.print(f"Stopped after iteration {self.step + 1} of {total}; the checkpoint is saved.")
+            say(f"Stopped after iteration {self.step + 1} of {total}; the checkpoint is saved.")
         finally:
             signal.signal(signal.SIGINT, former)
         return not self._interrupted
@@ -193,17 +225,28 @@ class SparseStyleTrainer(Trainer, ABC):
     def _train_complete_viewer(self) -> None:
         """The viewer stays until Ctrl-C, which ends the command as if there were none."""
         self.finish()
+        if self._interrupted:  # while the last checkpoint was saved
+            raise StoppedByCtrlC
+        self._waits = True
         try:
             super()._train_complete_viewer()
         except KeyboardInterrupt:
-            CONSOLE.print("The viewer is closed.")
+            say("The viewer is closed.")
 
     def _on_interrupt(self, number: int, frame: Optional[FrameType]) -> None:
-        if self._interrupted or self.training_state == "completed":
+        if self._waits:
             raise KeyboardInterrupt
+        if self._interrupted_at is not None and time.monotonic() - self._interrupted_at < SECONDS_OF_ONE_PRESS:
+            return
+        if self._interrupted:
+            kept = "nothing was saved" if self._kept_step is None else f"iteration {self._kept_step + 1} is saved"
+            stop(f"Stopped by Ctrl-C at once; {kept}.")
         self._interrupted = True
-        self.training_state = "training"  # one that the viewer paused goes on for an iteration
-        CONSOLE.print("Ctrl-C: finishing this iteration, then saving. Press it again to stop at once.")
+        if self.training_state == "paused":  # by the viewer; it goes on for an iteration
+            self.training_state = "training"
+        self._interrupted_at = time.monotonic()
+        if comms.is_main_process():  # not by Python's printing, which may be what is interrupted
+            os.write(1, b"\nCtrl-C: finishing this iteration, then saving. Press it again to stop at once.\n")
 
     def train_iteration(self, step: int) -> Tuple[Tensor, Dict[str, Tensor], Dict[str, Tensor]]:
         """One iteration: its loss, the losses by name, and metrics."""
@@ -258,7 +301,7 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def finish(self) -> None:
         """Prints the command's last line."""
-        if self._interrupted:
+        if self._interrupted and self.step + 1 < self.config.max_num_iterations:
             made = f"{self.base_dir}, up to iteration {self.step + 1} of {self.config.max_num_iterations}"
             finish(made, resume_command(self.config.method_name, self.checkpoint_dir))
         else:
@@ -270,13 +313,14 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def notes(self) -> CheckpointNotes:
         """What a checkpoint says beside the state."""
-        return {"effects": self.pipeline.effects.records()}
+        return run_notes(self.pipeline.effects, self.record)
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Saves a checkpoint as nerfstudio does, but only a whole and finite one, and drops the former one after that.
 
-        While steps are being skipped nothing is saved; at the end of training the former checkpoint is kept then.
+        None is dropped that was there when training began or went on. While steps are being skipped nothing is saved;
+        at the end of training the former checkpoint is kept then.
         """
         suspect = self._look_at_skipped(step) > 0
         if suspect and not self._interrupted and step + 1 < self.config.max_num_iterations:
@@ -291,10 +335,9 @@ class SparseStyleTrainer(Trainer, ABC):
                 "one is still there. Make room, and go on from it with --load-dir."
             ) from error
         self._kept_step = step
-        if self.config.save_only_latest_checkpoint and not suspect:
-            for path in self.checkpoint_dir.glob("step-*.ckpt"):
-                if path != target:
-                    path.unlink()
+        if self.config.save_only_latest_checkpoint and not suspect and self._own_checkpoint not in (None, target):
+            self._own_checkpoint.unlink(missing_ok=True)
+        self._own_checkpoint = target
         if self.pipeline.effects != self._saved_decisions:
             self._save_decisions()
 

@@ -1,8 +1,7 @@
 """One step of training, the same for the trainer, warm start, restyling and studies, and training of such steps."""
 
-import copy
 import functools
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, Callable, Dict, Iterator, Mapping, Optional, Tuple, Type
 
@@ -10,14 +9,12 @@ import torch
 from jaxtyping import Float
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, OptimizerConfig, Optimizers
-from nerfstudio.engine.schedulers import MultiStepSchedulerConfig, Scheduler
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
 from torch.amp import GradScaler
-from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 
+from sparsestyle_ns.engine.schedules import over_iterations
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleTask
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.utils.errors import InputError
@@ -44,30 +41,6 @@ class MuonConfig(OptimizerConfig):
     momentum: float = 0.95
     """Decay of the running mean of gradients."""
     weight_decay: float = 0.0
-
-
-@dataclass
-class WarmUpSchedulerConfig(MultiStepSchedulerConfig):
-    """A learning rate that rises evenly in the first iterations, and falls by a factor at some later ones."""
-
-    _target: Type = field(default_factory=lambda: WarmUpScheduler)
-    warm_up: int = 15
-    """Iterations until it is whole; Adam's first steps are as long as its learning rate, whatever the gradient is."""
-
-
-class WarmUpScheduler(Scheduler):
-    """See `WarmUpSchedulerConfig`."""
-
-    config: WarmUpSchedulerConfig
-
-    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
-        """The schedule of an optimiser."""
-
-        def factor(step: int) -> float:
-            falls = sum(step >= milestone for milestone in self.config.milestones)
-            return min(1.0, (step + 1) / max(1, self.config.warm_up)) * self.config.gamma**falls
-
-        return LambdaLR(optimizer, factor)
 
 
 def training_step(
@@ -150,7 +123,8 @@ class Training:
         if prepare is not None:
             prepare(self.pipeline)
         kind = FiniteOptimizers if isinstance(self.pipeline, CheckedPipeline) else Optimizers
-        self.optimizers = kind(copy.deepcopy(config.optimizers), self.pipeline.get_param_groups())
+        optimizers = over_iterations(config.optimizers, config.max_num_iterations)
+        self.optimizers = kind(optimizers, self.pipeline.get_param_groups())
         attributes = TrainingCallbackAttributes(self.optimizers, None, self.pipeline, SimpleNamespace(config=config))
         self.callbacks = self.pipeline.get_training_callbacks(attributes)
         self.num_steps = 0

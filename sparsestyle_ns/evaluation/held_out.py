@@ -19,16 +19,19 @@ from sparsestyle_ns.core.occupancy import interval_lengths
 from sparsestyle_ns.core.precision import autocast
 from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.volrend import dense_weights, effective_samples, optical_depth
+from sparsestyle_ns.losses.nnfm import NNFMLoss, nearest_neighbors
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.art_fid import ArtFID
 from sparsestyle_ns.metrics.consistency import RANGES, PathGeometry
 from sparsestyle_ns.metrics.image import gram_distance, gram_matrix, image_metrics, psnr, structural_similarity
+from sparsestyle_ns.metrics.strokes import stroke_width
 from sparsestyle_ns.metrics.style_distance import StyleDistance
 from sparsestyle_ns.metrics.warping import MIN_COVERAGE, Pinhole, Surface
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
 from sparsestyle_ns.models.hier_style import HierStyleModel
+from sparsestyle_ns.runs.checkpoints import CHECKPOINT_FOLDER, checkpoint_path
 from sparsestyle_ns.runs.run_folder import REPORT_FILE
-from sparsestyle_ns.utils.files import write_whole
+from sparsestyle_ns.utils.files import digest, keep_former, write_whole
 from sparsestyle_ns.utils.progress import track
 
 EVEN_SAMPLES = 64
@@ -55,17 +58,31 @@ class HeldOutReport:
         found = by_figure(self.views)
         return {f"{key}_std": statistics.stdev(values) for key, values in found.items() if len(values) > 1}
 
-    def save(self, path: Path, experiment: str, method: str, step: int) -> None:
-        """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means."""
+    def save(self, path: Path, experiment: str, method: str, step: int, checkpoint: Optional[Path] = None) -> None:
+        """Writes JSON in the layout of `ns-eval`, with the views' own values beside the means.
+
+        What a run's own report said before, if it was something else, is kept under another name.
+        """
         run = {"experiment_name": experiment, "method_name": method, "step": step}
-        write_whole(path, json.dumps({**run, "results": self.means, "views": self.views}, indent=2) + "\n")
+        if checkpoint is not None:
+            run["checkpoint"] = digest(checkpoint.read_bytes())
+        content = json.dumps({**run, "results": self.means, "views": self.views}, indent=2) + "\n"
+        if path.name == REPORT_FILE:
+            keep_former(path, content)
+        write_whole(path, content)
 
 
 def saved_report(folder: Path, step: int) -> Optional[HeldOutReport]:
-    """The report in a run's folder, where there is one of the checkpoint of iteration `step`."""
+    """The report in a run's folder, where there is one of the checkpoint of iteration `step` as it is now."""
     try:
         content = json.loads((folder / REPORT_FILE).read_text())
-        return HeldOutReport(content["results"], list(content["views"])) if content["step"] == step else None
+        if content["step"] != step:
+            return None
+        if "checkpoint" in content:  # earlier versions said no more than the iteration
+            checkpoint = checkpoint_path(folder / CHECKPOINT_FOLDER, step)
+            if content["checkpoint"] != digest(checkpoint.read_bytes()):
+                return None
+        return HeldOutReport(content["results"], list(content["views"]))
     except (OSError, ValueError, KeyError, TypeError):  # there is none, or another file has its name
         return None
 
@@ -165,7 +182,10 @@ class StyleFigures:
 
     def __init__(self, targets: StyleTargets) -> None:
         self.targets = targets
-        self.gram = gram_matrix(targets.style_rows())
+        rows = targets.style_rows()
+        self.gram, self.num_features = gram_matrix(rows), len(rows)
+        style = targets.by_name.get("style")
+        self.index = style.index if isinstance(style, NNFMLoss) else None
         self.distance = StyleDistance(targets.style_picture)
 
     @torch.no_grad()
@@ -178,9 +198,10 @@ class StyleFigures:
         """How strong a view's style is, before (`…_before`) and after stylising, and how far its content has moved.
 
         `style_loss` and `content_loss` are Eq. 5's: nearest neighbour feature matching, and the features' distance from
-        the unstylised view; other losses of `targets` are `NAME_loss`, `gram_distance` is that of `metrics.image`, and
-        the rest are of `StyleDistance`. With `accumulation`, only where the scene covers the picture: a background
-        can't be stylised.
+        the unstylised view; other losses of `targets` are `NAME_loss`, `gram_distance` is that of `metrics.image`,
+        `features_used` is the share of the painting's feature vectors, or where a view has fewer, of as many, that are
+        the most similar one of some place; `stroke_width` is that of `metrics.strokes` in pixels, and the rest are of
+        `StyleDistance`. With `accumulation`, only where the scene covers the picture: a background can't be stylised.
         """
         content, figures = self.targets.features(coarse), {}
         for suffix, picture in (("_before", coarse), ("", stylised)):
@@ -188,6 +209,10 @@ class StyleFigures:
             found = {f"{name}_loss": float(value) for name, value in self.targets.losses(view).items()}
             found["gram_distance"] = float(gram_distance(gram_matrix(view.features), self.gram))
             found |= self.distance.figures(picture, accumulation)
+            found["stroke_width"] = stroke_width(picture)
+            if self.index is not None:
+                chosen = nearest_neighbors(view.features, self.index)
+                found["features_used"] = len(chosen.unique()) / min(len(chosen), self.num_features)
             figures |= {f"{name}{suffix}": value for name, value in found.items()}
         figures.pop("content_loss_before", None)
         return figures

@@ -22,6 +22,8 @@ LABELS: Dict[str, Tuple[str, int]] = {
     "texture_distance": ("texture distance to the style ↓", 3),
     "color_distance": ("colour distance to the style ↓", 3),
     "colors_used": ("share of its colours used ↑", 2),
+    "features_used": ("share of its features used ↑", 2),
+    "stroke_width": ("stroke width, pixels", 1),
     "art_fid": ("ArtFID ↓", 2),
     "content_loss": ("feature distance to the content ↓", 3),
     "content_ssim": ("SSIM to the photo ↑", 3),
@@ -30,7 +32,8 @@ LABELS: Dict[str, Tuple[str, int]] = {
 }
 """A figure's name in words, with the direction that is better, and its decimals."""
 COARSE_QUALITY = ("psnr", "ssim", "lpips", "st_lpips", "effective_samples")
-STYLE = ("style_loss", "gram_distance", "texture_distance", "color_distance", "colors_used")
+STYLE_DISTANCES = ("style_loss", "gram_distance", "texture_distance", "color_distance")
+STYLE = (*STYLE_DISTANCES, "colors_used", "features_used", "stroke_width")
 """Figures that an unstylised view has too."""
 STYLE_AND_CONTENT = (*STYLE, "art_fid", "content_loss")
 PERCEPTUAL = ("rmse", "ssim", "lpips", "st_lpips")

@@ -32,7 +32,8 @@ class ExportOptions(CommandOptions):
     """What to write: a page, splats as PLY or as glTF, points or a mesh."""
     resolution: int = 255
     """html: cells along a side of the scene's cube. Every browser with WebGL2 can hold 255."""
-
+    force: bool = False
+    """Write over the file, if there is one of that name."""
     mesh: bool = False
     """glb: the mesh in place of splats."""
     max_splats: Optional[int] = None
@@ -50,4 +51,4 @@ class ExportOptions(CommandOptions):
         if self.max_splats is not None and self.max_splats < 1000:
             raise InputError(f"--max-splats {self.max_splats} shows no scene; give 1000 or more.")
         find_config(self.run, STYLE_METHOD)
-        prepare_output(self.output_path, "The scene", EXAMPLES.get(self.format, "scene.ply"))
+        prepare_output(self.output_path, "The scene", EXAMPLES.get(self.format, "scene.ply"), self.force)

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Tuple
+from typing import Annotated, Optional, Tuple
 
 import tyro
 
 from sparsestyle_ns.runs.run_folder import STYLE_METHOD, find_config
 from sparsestyle_ns.utils.errors import CommandOptions, InputError
-from sparsestyle_ns.utils.files import prepare_output
+from sparsestyle_ns.utils.files import free_path, prepare_output
 
 
 @dataclass
@@ -22,8 +22,8 @@ class GalleryOptions(CommandOptions):
 
     runs: Annotated[Tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
     """Stylised runs to show, each by its folder or its config.yml."""
-    output_path: Path = Path("gallery.html")
-    """The page to write."""
+    output_path: Optional[Path] = None
+    """The page to write; left out, gallery.html here, or gallery-2.html where that is there already."""
     video: Tuple[Path, ...] = ()
     """MP4 files, as ns-render writes them, to show instead of films made here: one for each run, in the same order."""
     title: str = "Stylised scenes"
@@ -34,6 +34,8 @@ class GalleryOptions(CommandOptions):
     """Frames of the film, a flight between the photos' viewpoints or a turn about the scene, 16 a second; 0: none."""
     evaluate: bool = False
     """Measure runs that have no evaluation.json of their newest checkpoint, and save it in their folders."""
+    force: bool = False
+    """Write over the page that --output-path names, if there is one."""
 
     def check(self) -> None:
         """Raises an `InputError` if there are no such runs, or the page can't be written."""
@@ -48,4 +50,5 @@ class GalleryOptions(CommandOptions):
             raise InputError(f"--frames is {self.frames}; give 0 for no film, or more.")
         for run in self.runs:
             find_config(run, STYLE_METHOD)
-        prepare_output(self.output_path, "The page", "index.html")
+        self.output_path = self.output_path or free_path(Path("gallery.html"))
+        prepare_output(self.output_path, "The page", "index.html", self.force)

@@ -12,7 +12,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from sparsestyle_ns.data.photos import PhotoDataset, at_size
 from sparsestyle_ns.data.view_selection import evenly_spaced
 from sparsestyle_ns.engine.hints import finish
-from sparsestyle_ns.engine.loading import load_run
+from sparsestyle_ns.engine.loading import LoadedRun, load_run
 from sparsestyle_ns.evaluation.held_out import HeldOutReport, exact_outputs, means_of, saved_report
 from sparsestyle_ns.evaluation.tables import Table, report_tables, table_of
 from sparsestyle_ns.gallery.film import as_pixels, make_film, read_film
@@ -20,9 +20,10 @@ from sparsestyle_ns.gallery.gallery_options import GalleryOptions
 from sparsestyle_ns.gallery.layout import Film, Picture, RunPictures, View, gallery_page, thumbnail
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipelineConfig
 from sparsestyle_ns.runs.run_folder import REPORT_FILE, STYLE_METHOD, find_config
+from sparsestyle_ns.runs.scene_record import ExpectedScene
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.files import write_output
+from sparsestyle_ns.utils.files import free_path, write_output
 from sparsestyle_ns.utils.page import Pixels
 from sparsestyle_ns.utils.progress import say, track
 
@@ -39,7 +40,7 @@ def make_gallery(options: GalleryOptions) -> None:
         runs.append(collect_run(run, film, options.num_views, options.frames, options.evaluate))
     page = write_output(options.output_path, gallery_page(runs, options.title), "The page", "index.html")
     first = find_config(options.runs[0]).parent
-    finish(page, ["sparsestyle", "export", first, "--format", "html", "--output-path", "scene.html"])
+    finish(page, ["sparsestyle", "export", first, "--format", "html", "--output-path", free_path(Path("scene.html"))])
 
 
 def collect_run(
@@ -57,7 +58,8 @@ def collect_run(
             report of its newest checkpoint. Without a report, the views that are shown are measured.
     """
     config_path = find_config(run, STYLE_METHOD)
-    config, pipeline, step = load_run(config_path)
+    loaded = load_run(config_path)
+    config, pipeline, step = loaded
     dataset = pipeline.datamanager.train_dataset
     originals = PhotoDataset(dataset._dataparser_outputs)  # at their files' size, whatever the run was trained on
     photos = [Picture(_photo(originals, index), path.name) for index, path in enumerate(originals.image_filenames)]
@@ -66,7 +68,7 @@ def collect_run(
         film = make_film(pipeline.model, dataset.cameras, frames, LONGEST_SIDE)
     report = saved_report(config_path.parent, step)
     if report is None and evaluate:
-        report = _evaluate(config_path.parent, config, pipeline, step)
+        report = _evaluate(config_path.parent, loaded)
     painting = config.pipeline.style_image
     return RunPictures(
         name=Path(config.experiment_name).name,
@@ -74,7 +76,7 @@ def collect_run(
         photos=photos,
         views=views,
         style_name="" if painting is None else painting.stem,
-        style=_style_picture(painting),
+        style=_style_picture(painting, pipeline.datamanager.config.expected),
         style_note=f"The style image, {painting}, is no longer there.",
         film=film,
         tables=[_views_table(measured)] if report is None else report_tables(report.means, len(report.views)),
@@ -83,11 +85,11 @@ def collect_run(
     )
 
 
-def _evaluate(folder: Path, config: TrainerConfig, pipeline: HierStylePipeline, step: int) -> HeldOutReport:
+def _evaluate(folder: Path, run: LoadedRun) -> HeldOutReport:
     """Measures a run on all held-out views, and saves the report in its folder, if that can be."""
-    report = pipeline.held_out_report()
+    report = run.pipeline.held_out_report()
     try:
-        report.save(folder / REPORT_FILE, config.experiment_name, config.method_name, step)
+        run.save_report(report, folder / REPORT_FILE)
     except OSError as error:
         say(f"{REPORT_FILE} can't be saved in {folder} ({error.strerror}); its figures are on the page.")
     return report
@@ -136,15 +138,17 @@ def _photo(dataset: PhotoDataset, index: int) -> Pixels:
     return thumbnail(dataset.get_image_uint8(index)[..., :3].numpy(), LONGEST_SIDE)
 
 
-def _style_picture(path: Optional[Path]) -> Optional[Picture]:
-    """The painting, where its file is still there."""
+def _style_picture(path: Optional[Path], expected: Optional[ExpectedScene]) -> Optional[Picture]:
+    """The painting, where its file is still there; its caption says where that is another picture by now."""
     if path is None:
         return None
     try:
-        pixels = Painting.read(path).pixels
+        painting = Painting.read(path)
     except InputError:
         return None
-    return Picture(thumbnail(as_pixels(pixels.permute(1, 2, 0).numpy()), LONGEST_SIDE), path.name)
+    is_other = expected is not None and expected.record.painting not in (None, painting.digest)
+    pixels = thumbnail(as_pixels(painting.pixels.permute(1, 2, 0).numpy()), LONGEST_SIDE)
+    return Picture(pixels, path.name + ", which is another picture by now" * is_other)
 
 
 def _views_table(views: Sequence[Dict[str, float]]) -> Table:
@@ -158,10 +162,10 @@ def _views_table(views: Sequence[Dict[str, float]]) -> Table:
 def _settings(config: TrainerConfig, dataset: PhotoDataset, photo_side: int, step: int) -> List[Tuple[str, str]]:
     pipeline: HierStylePipelineConfig = config.pipeline
     height, width = int(dataset.cameras.height[0]), int(dataset.cameras.width[0])
-    side, weight = pipeline.feature_side or photo_side, pipeline.loss_weights["content"]
+    weight = pipeline.loss_weights["content"]
     sizes, weights = [], []
     for level in pipeline.levels(config.max_num_iterations):
-        sizes.append(f"{round(level.scale * side)} pixels in {level.length} iterations")
+        sizes.append(f"{pipeline.side_at(level.scale, photo_side)} pixels in {level.length} iterations")
         first, last = (
             pipeline.weights_at(at, level)["content"] if weight > 0 else 0.0
             for at in (level.first, level.first + level.length)

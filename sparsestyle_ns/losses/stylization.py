@@ -71,8 +71,8 @@ class StyleTargets:
     Not a module of the model: a stylised checkpoint holds neither the network nor the painting.
 
     Args:
-        feature_side: longer side, in pixels, at which the network sees rendered and content pictures.
-        style_side: longer side, in pixels, at which it sees the style image; it sets how large strokes are.
+        feature_side: longer side, in pixels, at which the network sees all pictures; the smaller,
+            the wider strokes are.
         style_features: at most so many of the style image's feature vectors count, drawn at random; None: all.
     """
 
@@ -81,12 +81,11 @@ class StyleTargets:
         backbone: Backbone,
         style_image: Float[Tensor, "3 H W"],
         feature_side: int,
-        style_side: int,
         style_features: Optional[int] = None,
         losses: Collection[str] = ("content", "style"),
     ) -> None:
         self.backbone, self.feature_side = backbone, feature_side
-        self.style_image, self.style_side = style_image, style_side
+        self.style_image = style_image
         with torch.no_grad():
             rows = self.style_rows()
             rows = rows if style_features is None else sample_rows(rows, style_features)
@@ -100,7 +99,7 @@ class StyleTargets:
     @property
     def style_picture(self) -> Float[Tensor, "3 h w"]:
         """The style image at the size at which the network sees it."""
-        return fit_side(self.style_image[None], self.style_side, self.backbone.smallest_side)[0]
+        return fit_side(self.style_image[None], self.feature_side, self.backbone.smallest_side)[0]
 
     @torch.no_grad()
     def style_rows(self) -> Float[Tensor, "rows C"]:

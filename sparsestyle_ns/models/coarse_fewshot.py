@@ -1,6 +1,6 @@
 """`coarse-fewshot`: learns the coarse field of a scene from a few photos (stage 1)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Dict, List, Optional, Tuple, Type
 
 import torch
@@ -169,20 +169,24 @@ class CoarseFewShotModel(SceneModel):
         own = self.render(segments, shard_rays(directions), shard_rays(edges), thinning)
         return DenseRender(**{name: gather_rays(part, len(edges)) for name, part in vars(own).items()}), edges
 
-    def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
-        """`rgb`, `accumulation`, and `depth` in world units; in training also what the losses need."""
-        segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
-        if not self.training:
+    def picture(self, rays: RayBundle) -> Dict[str, Tensor]:
+        """What `get_outputs` gives outside of training."""
+        segments, unbounded, background = self.shown(rays)
+        with autocast(self.device, self.config.precision):
             if self.learns:
                 edges = self.place_samples(segments, self.config.num_samples, None)
-                render = self.render(segments, ray_bundle.directions, edges)
+                render = render_coarse(self.field, segments, rays.directions, edges, unbounded, background)
             else:
-                with autocast(self.device, self.config.precision):
-                    render = render_frozen(
-                        self.field, segments, ray_bundle.directions, self.marching(), self.background
-                    )
-            depth = surface_distance(segments, render.s)
-            return {"rgb": render.rgb, "accumulation": render.accumulation, "depth": depth}
+                marching = replace(self.marching(), unbounded=unbounded)
+                render = render_frozen(self.field, segments, rays.directions, marching, background)
+        depth = surface_distance(segments, render.s)
+        return {"rgb": render.rgb, "accumulation": render.accumulation, "depth": depth}
+
+    def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
+        """`rgb`, `accumulation`, and `depth` in world units; in training also what the losses need."""
+        if not self.training:
+            return self.picture(ray_bundle)
+        segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
         render, edges = self.render_batch(segments, ray_bundle.origins, ray_bundle.directions)
         if self.grid is not None:
             self.grid.remember(render.positions, render.density)

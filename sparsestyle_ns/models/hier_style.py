@@ -1,8 +1,8 @@
 """`hier-style`: the coarse field, frozen, and the residual field that stylises it (stage 2)."""
 
 import math
-from dataclasses import dataclass, field
-from typing import Any, Dict, List, Optional, Tuple, Type
+from dataclasses import dataclass, field, replace
+from typing import Any, Dict, Iterable, List, Optional, Tuple, Type
 
 import torch
 from jaxtyping import Float
@@ -12,6 +12,7 @@ from torch.nn import Parameter
 
 from sparsestyle_ns.core.occupancy import DensityVolume, Occupancy
 from sparsestyle_ns.core.precision import autocast
+from sparsestyle_ns.core.spaces import Segments
 from sparsestyle_ns.fields.fine import FineFieldConfig, FineTunedField, StylisedField
 from sparsestyle_ns.metrics.image import image_metrics, structural_similarity
 from sparsestyle_ns.models.scene_model import SceneModel, SceneModelConfig
@@ -21,7 +22,7 @@ from sparsestyle_ns.rendering.few_samples import FewSamples
 from sparsestyle_ns.rendering.frozen_view import FrozenView, equal_runs
 from sparsestyle_ns.rendering.look import Display, Look, RenderMode
 from sparsestyle_ns.rendering.mixing import Mix
-from sparsestyle_ns.rendering.render import FrozenSamples, PackedRender, straight_color, surface_distance
+from sparsestyle_ns.rendering.render import FrozenSamples, PackedRender, surface_distance
 from sparsestyle_ns.rendering.visible_samples import Marching
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.numba_kernels import untraced
@@ -157,12 +158,12 @@ class HierStyleModel(SceneModel):
         self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], marching: Optional[Marching] = None
     ) -> FrozenSamples:
         """`freeze_samples` of rays for this model's own style, by default those on which it learns."""
-        marching = marching or self.learning
+        parts = zip(origins.split(RAYS_PER_CALL), directions.split(RAYS_PER_CALL), strict=True)
+        return self._freeze((self.space.segments(*part) for part in parts), marching or self.learning)
+
+    def _freeze(self, parts: Iterable[Segments], marching: Marching) -> FrozenSamples:
         with autocast(self.device, self.config.precision):
-            frozen = [
-                render.freeze_samples(self.field, self.residual, self.space.segments(*part), marching)
-                for part in zip(origins.split(RAYS_PER_CALL), directions.split(RAYS_PER_CALL), strict=True)
-            ]
+            frozen = [render.freeze_samples(self.field, self.residual, part, marching) for part in parts]
             return FrozenSamples.joined(frozen, self.residual)
 
     def freeze_view(
@@ -191,16 +192,17 @@ class HierStyleModel(SceneModel):
     @untraced
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
         """`rgb` (stylised), `accumulation`, `depth` in world units, and the same of the coarse field as `…_coarse`."""
-        segments = self.space.segments(ray_bundle.origins, ray_bundle.directions)
-        look = self.display.look
+        segments, unbounded, background = self.shown(ray_bundle)
+        look, marching = self.display.look, replace(self.marching, unbounded=unbounded)
         styles = look.styles or (self.residual,)
         if look.mode == "baked" and not self.training:
-            fine, coarse = self.baked.render(styles, segments, self.marching, self.background, look.mix)
+            fine, coarse = self.baked.render(styles, segments, marching, background, look.mix)
         else:
-            origins, directions = ray_bundle.origins, ray_bundle.directions
-            frozen = self.freeze(origins, directions, self.marching)
+            directions, starts = ray_bundle.directions, range(0, len(ray_bundle), RAYS_PER_CALL)
+            parts = (self.shown(ray_bundle[start : start + RAYS_PER_CALL]).segments for start in starts)
+            frozen = self._freeze(parts, marching)
             with autocast(self.device, self.config.precision):
-                fine, coarse = render.render_mixed(self.field, styles, frozen, directions, self.background, look.mix)
+                fine, coarse = render.render_mixed(self.field, styles, frozen, directions, background, look.mix)
         return {
             "rgb": fine.rgb,
             "rgb_coarse": coarse.rgb,
@@ -218,11 +220,6 @@ class HierStyleModel(SceneModel):
         rays = camera_ray_bundle.to(self.device).flatten()
         parts = [self(rays[start : start + BAKED_RAYS]) for start in range(0, len(rays), BAKED_RAYS)]
         return {name: torch.cat([part[name] for part in parts]).view(*camera_ray_bundle.shape, -1) for name in parts[0]}
-
-    def get_rgba_image(self, outputs: Dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """Colour without background, and the stylised geometry's opacity, for `ns-export tsdf` and ns-render's rgba."""
-        color = straight_color(outputs[output_name], outputs["accumulation"], self.background)
-        return torch.cat([color, outputs["accumulation"]], dim=-1)
 
     def get_loss_dict(
         self, outputs: Dict[str, Tensor], batch: Dict[str, Any], metrics_dict: Optional[Dict[str, Tensor]] = None

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Dict, Literal, Optional, Tuple, Type, Union
@@ -17,7 +18,7 @@ from nerfstudio.data.datamanagers.base_datamanager import (
     VanillaDataManagerConfig,
     variable_res_collate,
 )
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.utils.dataloaders import RandIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -30,6 +31,7 @@ from sparsestyle_ns.data.view_selection import select_views
 from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.effects.matched_depth import MatchedRays, matched_rays
 from sparsestyle_ns.effects.scene import Scene
+from sparsestyle_ns.runs.scene_record import ExpectedScene, SceneRecord, record_scene
 from sparsestyle_ns.utils.distributed import num_processes
 from sparsestyle_ns.utils.errors import InputError
 
@@ -51,6 +53,8 @@ class FewShotDataManagerConfig(VanillaDataManagerConfig):
     """Rays to matched points in a batch, over its other rays; none where `matched_depth` is off (see Effects)."""
     seed: int = 42
     """Seed of the choice of pixels; a step's batch depends on it and the step alone, so a resumed run sees the same."""
+    expected: tyro.conf.Suppress[Optional[ExpectedScene]] = None
+    """What the scene has to be, where a run of it is opened or gone on with; not in config.yml."""
 
 
 @dataclass
@@ -115,15 +119,25 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
             raise InputError(f"--pipeline.datamanager.train-num-rays-per-batch is {rays}; give 1 or more.")
         if config.data is None:
             config.data = config.dataparser.data
-        config.dataparser.data = config.data = Path(config.data)
+        config.dataparser.data = config.data = Path(config.data).expanduser()
         self.dataparser = config.dataparser.setup()
         if test_mode == "inference":
             self.dataparser.downscale_factor = 1  # as in nerfstudio, whose parser then opens no photo
         self.includes_time = self.dataparser.includes_time
         self.test_split = "val" if test_mode == "val" else "test"
-        self.train_dataparser_outputs = self._chosen_views()
-        self.train_dataset = self._dataset(self.train_dataparser_outputs)
-        self.eval_dataset = self.create_eval_dataset()
+        try:
+            self.train_dataparser_outputs = self._chosen_views(self.dataparser)
+            self.train_dataset = self._dataset(self.train_dataparser_outputs)
+            self.eval_dataset = self.create_eval_dataset()
+        except InputError as error:
+            if config.expected is None:
+                raise
+            raise config.expected.refusal(str(config.data), error.fault) from error
+        if config.expected is not None:
+            held_out = self._held_out if self.test_split == "test" else None
+            # For mere inference photos needn't be there, and those that the parser names may be of another size.
+            with_photos = test_mode != "inference"
+            config.expected.check(record_scene(config.data, self.train_dataparser_outputs, None, held_out, with_photos))
         self.exclude_batch_keys_from_device = self.train_dataset.exclude_batch_keys_from_device
         if config.masks_on_gpu and "mask" in self.exclude_batch_keys_from_device:
             self.exclude_batch_keys_from_device.remove("mask")
@@ -131,9 +145,12 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
             config.collate_fn = variable_res_collate  # what nerfstudio does for photos of several sizes
         DataManager.__init__(self)
 
-    def _chosen_views(self) -> DataparserOutputs:
-        outputs = read_scene(self.dataparser)
-        info, asked = scene_info(outputs), (self.config.num_views, self.config.view_ids)
+    def _chosen_views(self, parser: DataParser) -> DataparserOutputs:
+        outputs = read_scene(parser)
+        info, asked, expected = scene_info(outputs), (self.config.num_views, self.config.view_ids), self.config.expected
+        gone = [] if expected is None else [view for view in expected.record.view_ids if view not in info.view_ids]
+        if gone:
+            raise InputError(f"it was trained on views {', '.join(map(str, gone))}, too, which aren't there any more")
         chosen = select_views(info.view_ids, *asked, info.default_num_views, info.standard_views)
         selected = select_outputs(outputs, chosen)
         if has_one_size(outputs.cameras):
@@ -147,7 +164,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
 
     def create_eval_dataset(self) -> PhotoDataset:
         """The dataparser's whole held-out split; the training views where it holds out none, as of very few photos."""
-        outputs = read_scene(self.dataparser, self.test_split)
+        outputs = self._held_out = read_scene(self.dataparser, self.test_split)
         if not outputs.image_filenames:
             CONSOLE.print("No view is held out; evaluating on the training views.")
             outputs = self.train_dataparser_outputs
@@ -163,6 +180,22 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         dataset = PhotoDataset(outputs, scale)
         dataset.cameras = at_size(outputs.cameras, dataset.cameras.width, dataset.cameras.height)
         return dataset
+
+    def record(self, effects: Decisions) -> SceneRecord:
+        """What says of a run on these views, with these effects, which scene it is of."""
+        outputs = self.train_dataparser_outputs
+        if self.test_mode == "inference":  # whose parser names photos of the full size
+            outputs = self._chosen_views(self.config.dataparser.setup())
+        return record_scene(self.config.data, outputs, effects)
+
+    def measured_views(self) -> Optional[DataparserOutputs]:
+        """The held-out views of the split that runs are measured on; None where a scene hasn't that split."""
+        if self.test_split == "test":
+            return self._held_out
+        try:
+            return read_scene(self.dataparser, "test")
+        except InputError:
+            return None
 
     @property
     def scene(self) -> Scene:
@@ -199,6 +232,10 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         """Rays to points of known depth; None where the effect is off. Found when training begins."""
         rays = None if self.effects is None else matched_rays(self.effects, self.scene)
         return None if rays is None else MatchedRays(**{key: part.to(self.device) for key, part in vars(rays).items()})
+
+    def get_datapath(self) -> Path:
+        """Where a viewer keeps camera paths: as nerfstudio's do, with the scene, else where the command was started."""
+        return self.config.data if os.access(self.config.data, os.W_OK) else Path.cwd()
 
     def setup_train(self) -> None:
         """Nothing yet: rays are generated once it is decided whether lenses bend them (`set_effects`)."""

@@ -26,6 +26,9 @@ from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress import say
 
+STROKE_SIZES = (0.5, 2.0)
+"""The smallest and the largest."""
+
 
 @dataclass
 class HierStylePipelineConfig(CheckedPipelineConfig):
@@ -44,14 +47,18 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     counts, and iterations before it are quick."""
     scale_shares: Tuple[float, ...] = (0.85, 0.15)
     """Shares of the iterations at these sizes."""
+    stroke_size: Annotated[float, tyro.conf.arg(aliases=("--stroke-size",))] = 1.0
+    """How wide strokes are, from 0.5 to 2: the feature network sees views and painting in this many times smaller
+    pictures, where its patches are as many times wider. 0.5 takes four times the network's time and memory."""
     feature_side: Optional[int] = None
-    """Longer side, in pixels, at which the feature network sees rendered views of the photos' size. None: theirs."""
-    style_side: Optional[int] = None
-    """Longer side at which it sees the style image then: smaller gives finer strokes. None: as the views."""
+    """Longer side, in pixels, at which the network sees views of the photos' size where strokes are of size 1. None:
+    theirs."""
     style_features: Optional[int] = None
     """Match with at most so many of the painting's feature vectors, drawn at random; None: all of them."""
     loss_weights: Dict[str, float] = field(default_factory=default_weights)
     """Weight of each loss, 0 or more; 0 is off. That of the content loss is λ0, which falls (Eq. 6)."""
+    object_style: float = 4.0
+    """How many times the style loss's weight counts for an object on a background, which keeps its shape by itself."""
     content_decay: float = 0.01
     """α, the share of the content loss's weight that is left in the end."""
     content_share: float = 0.6
@@ -76,12 +83,17 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         """The painting and the feature network, on the CPU; InputError where these or a setting can't be used."""
         if self.style_features is not None and self.style_features < 1:
             raise InputError(f"--pipeline.style-features is {self.style_features}; at least one vector is needed.")
+        smallest, largest = STROKE_SIZES
+        if not smallest <= self.stroke_size <= largest:
+            raise InputError(f"--stroke-size is {self.stroke_size:g}; give a number from {smallest:g} to {largest:g}.")
         for name, weight in self.loss_weights.items():
             if name not in LOSSES:
                 known = ", ".join(LOSSES)
                 raise InputError(f"--pipeline.loss-weights names {name}, which is no loss; the losses are {known}.")
             if not 0.0 <= weight < math.inf:
                 raise InputError(f"--pipeline.loss-weights.{name} is {weight}; give a finite number, 0 or more.")
+        if not 0.0 < self.object_style < math.inf:
+            raise InputError(f"--pipeline.object-style is {self.object_style}; give a number above 0.")
         if not any(self.loss_weights.values()):
             raise InputError("--pipeline.loss-weights turns every loss off; give one of them a weight above 0.")
         if self.style_image is None:
@@ -94,6 +106,10 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
             raise InputError(f"--pipeline.content-restart is {self.content_restart}; give a number above 0.")
         return coarse_to_fine(self.view_scales, self.scale_shares, iterations)
 
+    def side_at(self, scale: float, photo_side: int) -> int:
+        """Longer side, in pixels, at which the network sees views at a scale of photos of a size, and the painting."""
+        return max(1, round(scale * (self.feature_side or photo_side) / self.stroke_size))
+
     def targets_of(
         self, painting: Painting, backbone: Backbone, device: torch.device, photo_side: int, scale: float = 1.0
     ) -> StyleTargets:
@@ -101,10 +117,9 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
 
         The network moves to the device.
         """
-        side = self.feature_side or photo_side
-        sides = (max(1, round(scale * each)) for each in (side, self.style_side or side))
+        side = self.side_at(scale, photo_side)
         losses = [name for name, weight in self.loss_weights.items() if weight > 0]
-        return StyleTargets(backbone.to(device), painting.pixels.to(device), *sides, self.style_features, losses)
+        return StyleTargets(backbone.to(device), painting.pixels.to(device), side, self.style_features, losses)
 
     def weights_at(self, step: int, level: Level) -> Dict[str, float]:
         """The weight of each loss that is on, in an iteration; that of the content loss is λ(t) (Eq. 6).
@@ -154,20 +169,32 @@ class HierStylePipeline(CheckedPipeline):
     """Told of each iteration and its losses, by a viewer that shows them."""
 
     def new_task(
-        self, style: nn.Module, painting: Painting, backbone: Backbone, effects: Decisions, iterations: int
+        self,
+        style: nn.Module,
+        painting: Painting,
+        backbone: Backbone,
+        effects: Decisions,
+        iterations: int,
+        stroke_size: Optional[float] = None,
     ) -> StyleTask:
-        """A field and a painting for the scene's views, which are shared as far as they depend on no painting."""
+        """A field and a painting for the scene's views, which are shared as far as they depend on no painting.
+
+        Strokes are of the config's size unless another is given.
+        """
         schedule = self.config.levels(iterations)
         if self.scene_views is None:
             self.scene_views = self.freeze_views()
-        targets = [self.targets_of(painting, backbone, level.scale) for level in schedule]
+        targets = [self.targets_of(painting, backbone, level.scale, stroke_size) for level in schedule]
         scales = [level.scale for level in schedule]
         views = self.scene_views.for_painting(dict(zip(scales, targets, strict=True)), effects)
         return StyleTask(style, list(map(StyleLevel, schedule, targets, views)))
 
-    def targets_of(self, painting: Painting, backbone: Backbone, scale: float = 1.0) -> StyleTargets:
+    def targets_of(
+        self, painting: Painting, backbone: Backbone, scale: float = 1.0, stroke_size: Optional[float] = None
+    ) -> StyleTargets:
         """A painting as the feature network sees it, for views at a scale of the photos."""
-        return self.config.targets_of(painting, backbone, self.device, self.datamanager.photo_side, scale)
+        config = self.config if stroke_size is None else replace(self.config, stroke_size=stroke_size)
+        return config.targets_of(painting, backbone, self.device, self.datamanager.photo_side, scale)
 
     def freeze_views(self) -> SceneViews:
         """The scene's views, with all that depends on no style."""
@@ -191,11 +218,22 @@ class HierStylePipeline(CheckedPipeline):
         """The painting to measure against, the run's own or another, where it is still there."""
         if self.targets is not None and style_image is None:
             return self.targets
-        path = style_image or self.config.style_image
+        path, expected = style_image or self.config.style_image, self.datamanager.config.expected
         if path is None or not path.is_file():
             say(f"The painting {path} isn't there any more, so nothing is measured against it.")
             return None
-        return self.targets_of(*replace(self.config, style_image=path).load_style())
+        try:
+            painting, backbone = replace(self.config, style_image=path).load_style()
+        except InputError as error:
+            if style_image is not None:  # which was asked for
+                raise
+            say(f"{error.fault}, so nothing is measured against {path}.")
+            return None
+        made_for = None if style_image is not None or expected is None else expected.record.painting
+        if made_for not in (None, painting.digest):
+            say(f"The painting {path} is another picture by now, so nothing is measured against it.")
+            return None
+        return self.targets_of(painting, backbone)
 
     def warm_start_loss(self, task: StyleTask, step: int) -> Dict[str, Float[Tensor, ""]]:
         """How far c_f, on the coarse geometry, is from the content picture of one photo; not in the paper.
@@ -217,7 +255,10 @@ class HierStylePipeline(CheckedPipeline):
             task.style.thinning = Thinning(self.config.thinning, generator)
         image = self.scene_views.render(view, task.style)
         values = targets.losses(targets.view(image, view.features, view.accumulation, step))
-        return image, Losses(values, self.config.weights_at(step, schedule))
+        weights = self.config.weights_at(step, schedule)
+        if self.model.background is not None and "style" in weights:
+            weights["style"] *= self.config.object_style
+        return image, Losses(values, weights)
 
     def get_train_loss_dict(self, step: int) -> Tuple[Dict[str, Tensor], Dict[str, Tensor], Dict[str, Any]]:
         """One whole view: λ(t) L_content, L_style, and other losses that are on (Eq. 5 and 6)."""

@@ -18,10 +18,13 @@ from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.evaluation.held_out import HeldOutReport, evaluate_held_out
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, FewShotDataManagerConfig
+from sparsestyle_ns.pipelines.nerfstudio_options import unused_in_training, unused_of_scene
+from sparsestyle_ns.pipelines.render_command import prepare_render
 from sparsestyle_ns.style.backbone import Backbone
 from sparsestyle_ns.style.backbones import BackboneChoice, load_backbone
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.machine import put_ffmpeg_on_path
+from sparsestyle_ns.utils.progress import say
 
 TestMode = Literal["test", "val", "inference"]
 
@@ -85,10 +88,19 @@ class CheckedPipeline(VanillaPipeline):
             ndc=scene_info(self.datamanager.train_dataparser_outputs).ndc,
             device=device,
         ).to(device)
+        self._say_what_is_unused()
         CONSOLE.print("Effects:", self.effects.text(), sep="\n", soft_wrap=True, highlight=False)
         self.panel = None if config.panel is None else config.panel(self)  # nerfstudio's viewer finds it here
         if test_mode != "val":
             put_ffmpeg_on_path()
+
+    def _say_what_is_unused(self) -> None:
+        """Names what was asked for, or is in the scene, and has no effect; and sees to it that ns-render can go on."""
+        prepare_render(self)
+        if self.test_mode == "val":
+            scene = unused_of_scene(self.datamanager.train_dataparser_outputs)
+            for line in (*unused_in_training(self.config), *scene):
+                say(line)
 
     def announce(self, backbone: Backbone) -> None:
         """Says which feature network is in use, and where its weights came from."""

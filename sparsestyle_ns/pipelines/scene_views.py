@@ -39,6 +39,8 @@ class ContentView:
     """How opaque the coarse field is in each pixel; for a painting None where there is no background behind it."""
     features: Optional[Float[Tensor, "1 C h w"]] = None
     """The feature network's view of the picture, once a painting has asked for it."""
+    seen_at: int = 0
+    """The longer side, in pixels, at which it saw the picture."""
 
 
 class SceneViews:
@@ -124,9 +126,11 @@ class SceneViews:
             if seen_through:
                 picture = torch.lerp(view.picture, picture, view.accumulation[..., None].clamp(0.0, 1.0))
             view = replace(view, picture=picture, features=None)
-        if view.features is None:  # those of a view's own picture are the same for every painting
-            view.features = targets.features(view.picture)
-        return view if seen_through else replace(view, accumulation=None)
+        if view.features is None or view.seen_at != targets.feature_side:
+            # Those of a view's own picture are the same for every painting, and kept for the next.
+            view.features, view.seen_at = targets.features(view.picture), targets.feature_side
+        # A copy: while one painting is trained, another may have the features made anew.
+        return replace(view, accumulation=view.accumulation if seen_through else None)
 
     def _palette(self, style_image: Float[Tensor, "3 H W"]) -> Palette:
         """The map of the photos' colours to the painting's."""

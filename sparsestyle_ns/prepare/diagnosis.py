@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from sparsestyle_ns.data.features import Features, find_features, linked_groups, mutual_matches
+from sparsestyle_ns.data.features import Features, estimated, find_features, linked_groups, mutual_matches
 from sparsestyle_ns.utils.progress import track
 
 COMPARED_SIDE = 1000
@@ -85,11 +85,11 @@ def compare_photos(first: Features, second: Features, shape: Sequence[int]) -> P
     if len(start) < MIN_MATCHES:
         return Pair(0)
     cv2.setRNGSeed(0)  # the same photos get the same verdict
-    matrix, inliers = cv2.findFundamentalMat(start, end, cv2.USAC_MAGSAC, EPIPOLAR_ERROR, 0.999, 10_000)
+    matrix, inliers = estimated(cv2.findFundamentalMat, start, end, cv2.USAC_MAGSAC, EPIPOLAR_ERROR, 0.999, 10_000)
     if matrix is None or matrix.shape != (3, 3) or inliers.sum() < MIN_MATCHES:
         return Pair(0 if inliers is None else int(inliers.sum()))
     agree = inliers.ravel() > 0
-    _, explained = cv2.findHomography(start[agree], end[agree], cv2.RANSAC, FLAT_ERROR, maxIters=5_000)
+    _, explained = estimated(cv2.findHomography, start[agree], end[agree], cv2.RANSAC, FLAT_ERROR, maxIters=5_000)
     flat = 0.0 if explained is None else float(explained.mean())
     homogeneous = np.linalg.svd(matrix)[2][-1]
     middle = 0.5 * np.array([shape[1], shape[0]])

@@ -1,13 +1,15 @@
 """Reading photos as cameras and phones store them, and bringing them to one size."""
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import List, Sequence, Tuple
 
-from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 
 from sparsestyle_ns.data.photos import images_in
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.pictures import UnknownPixelsError, as_upright, orientation_of, to_8_bits
 
 HEIC_SUFFIXES = (".heic", ".heif")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", *HEIC_SUFFIXES)
@@ -67,6 +69,9 @@ def find_photos(folder: Path) -> List[Path]:
             f"{folder} has {count} ({', '.join(SUFFIXES)}); a scene needs at least {MIN_PHOTOS}, each taken from "
             "another place."
         )
+    others = sorted(set(images_in(place, tuple(Image.registered_extensions()))) - set(photos))
+    if others:
+        print(f"Passed over, as they are none of {', '.join(SUFFIXES)}: {', '.join(path.name for path in others)}")
     return photos
 
 
@@ -79,13 +84,13 @@ def read_photo(path: Path, upright: bool = True) -> Photo:
     if path.suffix.lower() in HEIC_SUFFIXES:
         _register_heic(path)
     try:
-        with Image.open(path) as image:
+        data = path.read_bytes()
+        with Image.open(io.BytesIO(data)) as image:
             image.load()  # by which Pillow turns a TIFF upright, and forgets the orientation
-            orientation = image.getexif().get(ExifTags.Base.Orientation)
-            turned = ImageOps.exif_transpose(image) if upright else image
-            transparent = turned.has_transparency_data and turned.convert("RGBA").getchannel("A").getextrema()[0] < 255
-            pixels = turned.convert("RGBA" if transparent else "RGB")
-            return Photo(path, pixels, orientation if orientation in range(2, 9) else 1, upright)
+            orientation, pixels = orientation_of(image), to_8_bits(image, data)
+            return Photo(path, as_upright(pixels, orientation) if upright else pixels, orientation, upright)
+    except UnknownPixelsError as error:
+        raise InputError(f"{path} has {error}; save it as 8-bit RGB or grey, or take it out.") from error
     except UnidentifiedImageError as error:
         raise InputError(
             f"{path} is no image that can be read; save it again as JPEG or PNG, or take it out."

@@ -3,6 +3,7 @@
 import copy
 import sys
 from contextlib import redirect_stdout
+from pathlib import Path
 from typing import List
 
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
@@ -14,9 +15,9 @@ from sparsestyle_ns.engine.hints import PAINTING, finish, flags_of, parser_argum
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.prepare.prepare_options import EffectsOptions
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
-from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD
-from sparsestyle_ns.runs.scene_record import record_scene
+from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD, find_config, read_config
 from sparsestyle_ns.style.painting import Painting
+from sparsestyle_ns.utils.errors import InputError
 
 
 def print_effects(options: EffectsOptions) -> None:
@@ -33,10 +34,21 @@ def next_command(dataparser: DataParserConfig, options: EffectsOptions) -> List[
     """Training on the scene, with the painting where there is a coarse run."""
     command = ["ns-train", COARSE_METHOD]
     if options.coarse_run is not None:
-        command = ["ns-train", STYLE_METHOD, "--style-image", str(options.style_image or PAINTING)]
+        command = ["ns-train", *_style_method(options.coarse_run)]
+        command += ["--style-image", str(options.style_image or PAINTING)]
     command += flags_of("--coarse-run", options.coarse_run)
     command += flags_of("--num-views", options.num_views) + flags_of("--view-ids", options.view_ids)
     return [*command, "--data", str(options.data), *parser_arguments(dataparser)]
+
+
+def _style_method(coarse_run: Path) -> List[str]:
+    """The method that stylises a coarse run as it was made: a draft as a draft, and at its size."""
+    try:
+        config = read_config(find_config(coarse_run, COARSE_METHOD).parent)
+    except InputError:
+        return [STYLE_METHOD]
+    size = flags_of("--max-image-side", config.pipeline.datamanager.max_image_side)
+    return [config.method_name.replace(COARSE_METHOD, STYLE_METHOD), *size]
 
 
 def measure_scene(dataparser: DataParserConfig, options: EffectsOptions) -> Decisions:
@@ -53,7 +65,7 @@ def measure_scene(dataparser: DataParserConfig, options: EffectsOptions) -> Deci
     effects = decide(scene, EffectSettings())
     if options.coarse_run is not None:
         run = read_coarse_run(options.coarse_run)
-        check_scene(run, record_scene(options.data, manager.train_dataparser_outputs, effects))
+        check_scene(run, manager.record(effects))
         scene.coarse_density = run.density(effects)
     if options.style_image is not None:
         scene.style_image = Painting.read(options.style_image).pixels

@@ -149,6 +149,9 @@ class TransformsPoses:
     def write(self, folder: Path, names: Sequence[str], framings: Sequence[Framing]) -> None:
         """See `LLFFPoses.write`. Distortion is in units of the focal length, and stays as it is."""
         names = [f"images/{name}" for name in names]
+        left_out = sorted({key for frame in self.used for key in PIXEL_MAPS if key in frame})
+        if left_out:
+            print(f"Left out of the scene, as they are for photos of the former size: {' and '.join(left_out)}")
         frames = []
         for index, (frame, name, framing) in enumerate(zip(self.used, names, framings, strict=True)):
             kept = {key: value for key, value in frame.items() if key not in PIXEL_MAPS}

@@ -200,7 +200,8 @@ def render_baked(
     volumes: Sequence[BakedVolume], segments: Segments, marching: Marching, background: Background, mix: Mix = STYLISED
 ) -> Tuple[PackedRender, PackedRender]:
     """The render of a mixture of one or two styles, which share coarse field and resolution, and the coarse render."""
-    march = march_compiled if volumes[0].codes.device.type == "cpu" else march_in_torch
+    is_cut = isinstance(segments, spaces.ContractedSegments) and segments.ends is not None
+    march = march_compiled if volumes[0].codes.device.type == "cpu" and not is_cut else march_in_torch
     return march(volumes, segments, marching, background, mix)
 
 

@@ -14,12 +14,17 @@ from torch.utils._pytree import tree_map_only
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 
+CHECKPOINT_FOLDER = "nerfstudio_models"
+"""Where a run's folder has them."""
+
 
 class CheckpointNotes(TypedDict, total=False):
     """What a checkpoint says beside the state: numbers and words only, and nothing of what isn't known."""
 
     effects: List[Dict[str, Any]]
     """`Decisions.records` of the scene."""
+    scene: Dict[str, Any]
+    """The `SceneRecord` of the photos that it was trained on, as a dictionary."""
     backbone: Dict[str, str]
     """Name, source and sha256 of the feature network that took part."""
     coarse_run: str
@@ -77,8 +82,8 @@ def write_checkpoint(
     for name, tensor in pipeline.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise InputError(
-                f"Iteration {step + 1} isn't saved, because {name} isn't finite in it; go on from an earlier "
-                "checkpoint with a lower learning rate, --optimizers.fields.optimizer.lr."
+                f"Iteration {step + 1} isn't saved, because {name} isn't finite in it",
+                "go on from an earlier checkpoint with a lower learning rate, --optimizers.fields.optimizer.lr",
             )
     state = {
         "step": step,

@@ -1,6 +1,8 @@
 """Runs on disk: finding and reading the config of one. Without torch, so that commands say at once what is wrong."""
 
+import contextlib
 import re
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +36,18 @@ def find_config(run: Path, method: str = "") -> Path:
     if not name[1].startswith(expected):
         raise InputError(f"{run} is a run of {name[1]}; name a run of {' or '.join(expected)}.")
     return path
+
+
+def remove_empty_run(folder: Path) -> None:
+    """Removes a run's folder that has neither a checkpoint nor a picture, and the folders around it that held it alone.
+
+    What else a run has says only what it would have been.
+    """
+    if folder.is_dir() and not any(folder.glob("*/*.ckpt")) and not any(folder.glob("previews/*")):
+        shutil.rmtree(folder, ignore_errors=True)
+        with contextlib.suppress(OSError):  # of a folder that has something in it
+            for around in folder.parents[:2]:
+                around.rmdir()
 
 
 def read_config(folder: Path) -> "TrainerConfig":

@@ -23,7 +23,11 @@ COLORS_ALONE: Settings = {"pipeline.effects.view_color": "on", "pipeline.effects
 """What both stages have to be told of every kind of stage 1 but ours."""
 CONSTANT: Settings = {"pipeline.content_decay": 1.0, "pipeline.content_restart": 1.0}
 """The content weight stays as it is in all iterations, at each size of the views."""
-PAPER_LOSSES: Settings = {"pipeline.loss_weights.colors": 0.0, "pipeline.loss_weights.textures": 0.0}
+PAPER_LOSSES: Settings = {
+    "pipeline.loss_weights.colors": 0.0,
+    "pipeline.loss_weights.textures": 0.0,
+    "pipeline.object_style": 1.0,
+}
 """Content and style alone, as ARF and the paper have it."""
 CONTENT_WEIGHTS = (0.1, 0.01, 0.001)
 """What ours begins with, ends with, and the middle between."""
@@ -83,18 +87,27 @@ class PaperRuns:
         settings = {**COARSE_KINDS[kind], **({} if kind == "ours" else COLORS_ALONE), **network}
         return Run(self.study, self.output_dir, kind, "coarse-fewshot", tuple(settings.items()))
 
-    def stylised(self, painting: Path, style_kind: str = "ours", coarse_kind: str = "ours") -> Run:
-        """The run of stage 2 of a kind, on a coarse field of a kind."""
-        iterations = self.study.iterations("hier-style")
+    def stylised(
+        self,
+        painting: Path,
+        style_kind: str = "ours",
+        coarse_kind: str = "ours",
+        content: Optional[float] = None,
+        own_iterations: Optional[int] = None,
+    ) -> Run:
+        """The run of stage 2 of a kind, on a coarse field of a kind; of another content weight or length if given."""
+        iterations = own_iterations or self.study.iterations("hier-style")
         colors = {} if coarse_kind == "ours" else COLORS_ALONE
-        settings = {**STYLE_KINDS[style_kind], **colors, **EVERY_LOSS, **self._network("hier-style")}
+        weight = {} if content is None else {"pipeline.loss_weights.content": content}
+        settings = {**STYLE_KINDS[style_kind], **weight, **colors, **EVERY_LOSS, **self._network("hier-style")}
         return Run(
             self.study,
             self.output_dir,
-            name=f"{coarse_kind}-{style_kind}-{painting.stem}",
+            name=f"{coarse_kind}-{style_kind}-{painting.stem}" + ("" if content is None else f"-{content:g}"),
             stage="hier-style",
             settings=tuple(settings.items()),
             painting=painting,
             coarse=self.coarse(coarse_kind),
+            own_iterations=own_iterations,
             pictures=(*(count for count in PICTURES if count < iterations), iterations),
         )

@@ -1,17 +1,19 @@
 """`sparsestyle compare` and `ablate`: the runs that the paper sets side by side (Tab. 1, Sec. 4.2), and their page."""
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Dict, List, Mapping, Sequence, Tuple
 
 from sparsestyle_ns.data.parser_choice import parse_dataparser
+from sparsestyle_ns.data.reading import read_scene
 from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.engine.previews import preview_path
 from sparsestyle_ns.evaluation.tables import COARSE_QUALITY, CONSISTENCY, STYLE, STYLE_AND_CONTENT, Table, table_of
 from sparsestyle_ns.metrics.art_fid import why_left_out
 from sparsestyle_ns.runs.scene_record import SceneRecord
 from sparsestyle_ns.studies.baselines import can_transfer, smooth_along_flow, transfer_frames
+from sparsestyle_ns.studies.front import front_section
 from sparsestyle_ns.studies.paper_runs import PICTURES, PaperRuns
 from sparsestyle_ns.studies.plots import line_plot
 from sparsestyle_ns.studies.run_figures import (
@@ -25,11 +27,11 @@ from sparsestyle_ns.studies.run_figures import (
 )
 from sparsestyle_ns.studies.run_queue import Run, RunQueue
 from sparsestyle_ns.studies.study import Study
-from sparsestyle_ns.studies.study_options import StudyOptions
+from sparsestyle_ns.studies.study_options import CompareOptions, StudyOptions
 from sparsestyle_ns.studies.study_page import Captioned, Plot, Section, study_page
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.files import prepare_output, write_output
+from sparsestyle_ns.utils.files import keep_former, prepare_output, write_output
 
 PAPER_ROWS: Dict[str, Tuple[float, ...]] = {
     "AdaIN": (0.189, 0.618, 0.276, 0.231, 0.601, 0.295),
@@ -237,7 +239,7 @@ def loss_plots(traces: Mapping[str, Mapping[str, Trace]], count: int) -> List[Pl
     }
     way = {name: (lines["content"][name][1], lines["style"][name][1]) for name in traces}
     mean = f"means over {count} iterations"
-    plots = [(line_plot(way, "content loss", "style loss", True), f"Way of both losses; dots: the end ({mean}).")]
+    plots = [(line_plot(way, "content loss", "style loss", "end"), f"Way of both losses; dots: the end ({mean}).")]
     for loss, series in lines.items():
         plots.append((line_plot(series, "iteration", f"{loss} loss"), f"The {loss} loss in training ({mean})."))
     return plots
@@ -248,9 +250,14 @@ def moving_mean(values: Sequence[float], count: int) -> List[float]:
     return [sum(part) / len(part) for part in (values[max(0, end - count) : end] for end in range(1, len(values) + 1))]
 
 
-def compare(options: StudyOptions) -> None:
+def compare(options: CompareOptions) -> None:
     """Trains what the comparison needs, and writes its page; an `InputError` for bad options or a failed run."""
     runs = check_options(options)
+    if options.front:
+        queue = RunQueue(options.output_dir / runs.study.name, jobs=1)  # beside another run, an iteration takes longer
+        sections = [front_section(runs, painting, queue) for painting in options.style_images]
+        finish(_write_page("Style against content", options, runs, sections), options.ablate_command())
+        return
     page = _run_study("Comparison", options, runs, [OF_METHODS], ("ours", "freenerf"))
     finish(page, options.ablate_command())
 
@@ -265,14 +272,23 @@ def ablate(options: StudyOptions) -> None:
 
 def check_options(options: StudyOptions) -> PaperRuns:
     """The runs that options describe, or an `InputError`: what can be wrong is found before hours of training."""
-    dataparser = parse_dataparser([options.parser], options.data)
+    try:
+        dataparser = parse_dataparser(shlex.split(options.parser or ""), options.data)
+        read_scene(replace(dataparser, data=options.data).setup())
+    except InputError as error:
+        if error.advice is None:
+            raise
+        advice = (
+            "leave --parser out, or name what reads it, with its options, as --parser='llff-data --eval-interval 4'"
+        )
+        raise InputError(error.fault, advice) from error
     if not options.style_images:
         raise InputError("There is no painting; name at least one with --style-images.")
     if options.jobs is not None and options.jobs < 1:
         raise InputError(f"--jobs is {options.jobs}; at least one run at a time is needed.")
     for painting in options.style_images:
         Painting.read(painting)
-    prepare_output(options.output_path, "The page", "index.html")
+    prepare_output(options.output_path, "The page", "index.html", force=True)
     named = ("draft", "max_image_side", "coarse_iterations", "style_iterations")
     flags = {name: tuple(shlex.split(getattr(options, name))) for name in ("coarse_flags", "style_flags")}
     study = Study(options.data, dataparser, **{name: getattr(options, name) for name in named}, **flags)
@@ -286,8 +302,14 @@ def _run_study(
     queue = RunQueue(options.output_dir / runs.study.name, options.jobs)
     queue.train(needed_runs(runs, comparisons, options.style_images))
     sections = study_sections(runs, comparisons, coarse_kinds, options.style_images)
+    return _write_page(title, options, runs, sections)
+
+
+def _write_page(title: str, options: StudyOptions, runs: PaperRuns, sections: Sequence[Section]) -> Path:
+    """Prints the sections' tables, and writes the page."""
     for section in sections:
         for table in section.tables:
             table.print()
     page = study_page(f"{title}: {runs.study.name}", sections)
+    keep_former(options.output_path, page)
     return write_output(options.output_path, page, "The page", "index.html")

@@ -3,7 +3,7 @@
 import contextlib
 import io
 import math
-from typing import Iterator, List, Mapping, Sequence, Tuple
+from typing import Iterator, List, Literal, Mapping, Sequence, Tuple
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -31,12 +31,17 @@ COLUMNS = 3
 
 
 def line_plot(
-    series: Mapping[str, Tuple[Sequence[float], Sequence[float]]], x_label: str, y_label: str, marks: bool = False
+    series: Mapping[str, Tuple[Sequence[float], Sequence[float]]],
+    x_label: str,
+    y_label: str,
+    marks: Literal["", "end", "all"] = "",
 ) -> str:
-    """Lines with a legend as SVG: x and y values of each by its name; `marks` puts a dot at their ends."""
+    """Lines with a legend as SVG: x and y values of each by its name; with dots at their ends or everywhere."""
     with _svg() as (cell, svg):
         for name, (x, y) in series.items():
-            cell.plot(x, y, label=name, linewidth=1.5, marker="o" if marks else "", markevery=[-1])
+            cell.plot(
+                x, y, label=name, linewidth=1.5, marker="o" if marks else "", markevery=[-1] if marks == "end" else None
+            )
         cell.set(xlabel=x_label, ylabel=y_label)
         cell.legend()
         cell.grid(True, **GRID)

@@ -1,8 +1,8 @@
 """What is measured of a run. Everything is kept beside it, so that a table is made again without rendering again."""
 
 import functools
+import itertools
 import json
-import shutil
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Callable, Dict, List, Optional, Sequence, Tuple
@@ -19,7 +19,7 @@ from sparsestyle_ns.evaluation.held_out import PathFrames, StyleFigures, render_
 from sparsestyle_ns.metrics.art_fid import ArtFID, missing_weights
 from sparsestyle_ns.metrics.image import has_lpips, structural_similarity
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
-from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.runs.checkpoints import CHECKPOINT_FOLDER, checkpoint_step, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import REPORT_FILE
 from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.progress import track
@@ -77,8 +77,8 @@ def measure_run(
 
     With the name of a way, and `stylise` for it, of frames stylised so in place of the run's own.
     """
-    step = checkpoint_step(newest_checkpoint(folder / "nerfstudio_models"))
-    target = folder / (f"measured-{way}" if way else "measured")
+    step = checkpoint_step(newest_checkpoint(folder / CHECKPOINT_FOLDER))
+    target = _free_for(folder / (f"measured-{way}" if way else "measured"), step)
     known = read_figures(target, step)
     if known is not None:
         return known
@@ -86,14 +86,22 @@ def measure_run(
     if stylise is not None:
         frames = replace(frames, stylised=stylise(frames))
     figures = {**frames.figures(), **painting.figures(frames, settings)}
-    shutil.rmtree(target, ignore_errors=True)
-    target.mkdir()
+    target.mkdir(exist_ok=True)
     for place, index in enumerate((0, len(frames.stylised) // 2, len(frames.stylised) - 1)):
         for name, pictures in (("stylised", frames.stylised), ("coarse", frames.coarse)):
             save_image(pictures[index].detach().cpu().permute(2, 0, 1), target / f"{name}-{place}.png")
     # Last, so that a folder with figures is a whole one.
     write_whole(target / FIGURES_FILE, json.dumps({"step": step, "figures": figures}, indent=1) + "\n")
     return RunFigures(figures, *_pictures(target))
+
+
+def _free_for(folder: Path, step: int) -> Path:
+    """A folder for what is measured of an iteration: this one, unless it has figures of another, which stay there."""
+    try:
+        taken = json.loads((folder / FIGURES_FILE).read_text())["step"] != step
+    except (OSError, ValueError, KeyError, TypeError):
+        taken = False
+    return folder.with_name(f"{folder.name}-{step:09d}") if taken else folder
 
 
 @functools.lru_cache(maxsize=1)
@@ -119,10 +127,21 @@ def read_figures(folder: Path, step: int) -> Optional[RunFigures]:
 
 def measure_coarse(folder: Path) -> Dict[str, float]:
     """A coarse run's figures on its held-out views, kept beside it."""
-    known = saved_report(folder, checkpoint_step(newest_checkpoint(folder / "nerfstudio_models")))
+    known = saved_report(folder, checkpoint_step(newest_checkpoint(folder / CHECKPOINT_FOLDER)))
     if known is not None and ("lpips" in known.means or not has_lpips()):
         return known.means
     return evaluate_run(folder / "config.yml", folder / REPORT_FILE).means
+
+
+def _logged(folder: Path) -> EventAccumulator:
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    return events.Reload()
+
+
+def iteration_times(folder: Path) -> Dict[int, float]:
+    """Seconds that a run's iterations took, by their number; of a run that logs every one, without the first."""
+    logged = sorted((event.step, event.wall_time) for event in _logged(folder).Scalars("Train Metrics Dict/style"))
+    return {step: end - start for (before, start), (step, end) in itertools.pairwise(logged) if step == before + 1}
 
 
 def loss_traces(folder: Path) -> Dict[str, Trace]:
@@ -130,9 +149,7 @@ def loss_traces(folder: Path) -> Dict[str, Trace]:
 
     An iteration that was done twice, before and after an interruption, counts as it was done last.
     """
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
-    events.Reload()
-    traces = {}
+    events, traces = _logged(folder), {}
     for name in ("content", "style"):
         last = {event.step: event.value for event in events.Scalars(f"Train Metrics Dict/{name}")}
         traces[name] = (sorted(last), [last[step] for step in sorted(last)])

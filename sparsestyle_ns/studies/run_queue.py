@@ -6,11 +6,12 @@ A run's folder carries a digest of all that decides the outcome: a finished run 
 import hashlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Callable, Dict, List, Mapping, Optional, Sequence, Tuple
 
@@ -23,6 +24,7 @@ from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.studies.study import Stage, Study
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
+from sparsestyle_ns.utils.interrupts import PRESSES, end_on_ctrl_c, stop
 from sparsestyle_ns.utils.progress import PROGRESS_FILE, ProgressReport, bar, duration, report, say
 
 SECONDS_FILE = "training_seconds.json"
@@ -51,6 +53,8 @@ class Run:
     painting: Optional[Path] = None
     coarse: Optional["Run"] = None
     """The run whose field it stylises."""
+    own_iterations: Optional[int] = None
+    """How many it has, where not as many as the study's other runs."""
     pictures: Tuple[int, ...] = ()
     """Iterations after which a picture is made of it on its way (see `preview_path`)."""
 
@@ -62,13 +66,14 @@ class Run:
     @property
     def iterations(self) -> int:
         """How many it has when it is finished."""
-        return self.study.iterations(self.stage)
+        return self.own_iterations or self.study.iterations(self.stage)
 
     @property
     def digest(self) -> str:
         """Eight hexadecimal digits of all that decides the outcome but the program itself."""
         study = self.study
         parts = [self.method, self.iterations, *self.settings, *study.flags(self.stage), study.data.resolve()]
+        parts.append(study.photo_digest)
         parts += [study.dataparser, study.max_image_side, study.num_views, study.view_ids]
         if self.painting is not None:
             parts.append(hashlib.sha256(self.painting.read_bytes()).hexdigest())
@@ -95,6 +100,7 @@ class Run:
     def config(self) -> SparseStyleTrainerConfig:
         """The config that trains it to its end, from where it is."""
         config = self.study.config(self.stage, dict(self.settings), self.painting)
+        config.max_num_iterations = self.iterations
         config.output_dir, config.experiment_name = self.output_dir, self.study.name
         config.timestamp = self.folder.name
         config.previews = tuple(count / self.iterations for count in self.pictures)
@@ -125,12 +131,14 @@ class RunQueue:
     """Runs at a time; None for one on a machine of few cores or with a GPU, else one for every four cores."""
     say: Callable[[str], None] = say
     """Told what goes on, a line at a time."""
+    _training: List[subprocess.Popen] = field(default_factory=list, init=False)
 
     def train(self, runs: Sequence[Run]) -> None:
         """Brings all runs, and the coarse ones they build on, to their end; named twice, one is trained once.
 
         Raises:
-            InputError: a run failed, or Ctrl-C was pressed; either way what is done is kept.
+            InputError: a run failed.
+            StoppedByCtrlC: Ctrl-C was pressed; either way what is done is kept.
         """
         wanted = list(dict.fromkeys([*(run.coarse for run in runs if run.coarse is not None), *runs]))
         self.say(self.forecast(wanted))
@@ -138,8 +146,8 @@ class RunQueue:
             for has_coarse in (False, True):
                 stage = [run for run in wanted if (run.coarse is not None) is has_coarse and not run.is_finished]
                 self._train_beside_each_other(stage, wanted)
-        except KeyboardInterrupt as interrupt:
-            raise InputError("Interrupted; the same command goes on where it was.") from interrupt
+        except PRESSES:
+            stop("Stopped by Ctrl-C; the same command goes on where it was.")
 
     def _train_beside_each_other(self, runs: Sequence[Run], wanted: Sequence[Run]) -> None:
         jobs = max(1, min(self._jobs(), len(runs)))
@@ -155,8 +163,10 @@ class RunQueue:
         with ThreadPoolExecutor(jobs) as pool:
             try:
                 list(pool.map(train, runs))
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
+            except BaseException as error:
+                pool.shutdown(wait=False, cancel_futures=True)
+                if isinstance(error, PRESSES):
+                    _interrupt(self._training)
                 raise
 
     def forecast(self, wanted: Sequence[Run]) -> str:
@@ -201,6 +211,7 @@ class RunQueue:
             log.open("a") as output,
             subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment) as process,
         ):
+            self._training.append(process)
             _follow(process, progress, name, total, done)
         if process.returncode != 0 or not run.is_finished:
             failure = ProgressReport.read(progress).failure or f"its process ended with status {process.returncode}"
@@ -211,14 +222,23 @@ class RunQueue:
         write_whole(run.folder / SECONDS_FILE, json.dumps(spent) + "\n")
 
 
+def _interrupt(processes: Sequence[subprocess.Popen]) -> None:
+    """Passes Ctrl-C on to runs, which a terminal has done already, and waits until they have saved what they have."""
+    for process in processes:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+    for process in processes:
+        process.wait()
+
+
 def _follow(process: subprocess.Popen, progress: Path, name: str, iterations: int, done: int) -> None:
     """Waits for a run, and shows how far it is by what it reports."""
     with bar(name, iterations, done, "iterations") as shown:
         while process.poll() is None:
             try:
                 process.wait(timeout=SECONDS_BETWEEN_LOOKS)
-            except KeyboardInterrupt:  # the run got it too, and saves what it has
-                process.wait()
+            except PRESSES:
+                _interrupt([process])
                 raise
             except subprocess.TimeoutExpired:
                 for work in ProgressReport.read(progress).works:
@@ -240,4 +260,5 @@ def train_run(config: SparseStyleTrainerConfig) -> None:
 
 
 if __name__ == "__main__":
+    end_on_ctrl_c()
     train_run(yaml.load(Path(sys.argv[1]).read_text(encoding="utf-8"), Loader=yaml.Loader))

@@ -2,16 +2,22 @@
 
 import copy
 import functools
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal, Mapping, Optional, Tuple, TypeVar
 
+import numpy as np
 import tyro
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 
+from sparsestyle_ns.data.reading import read_scene
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.runs.scene_record import record_views
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import digest
 
 Stage = Literal["coarse-fewshot", "hier-style"]
 C = TypeVar("C")
@@ -33,6 +39,17 @@ class Study:
     style_iterations: Optional[int] = None
     coarse_flags: Tuple[str, ...] = ()
     style_flags: Tuple[str, ...] = ()
+
+    @functools.cached_property
+    def photo_digest(self) -> str:
+        """By which it is known whether photos or poses are the same; empty where the scene can't be read."""
+        try:
+            parser = replace(self.dataparser, data=self.data).setup()
+            views = [record_views(read_scene(parser, split)) for split in ("train", "test")]
+        except InputError:
+            return ""
+        parts = [[part.names, part.digests, np.round(part.cameras, 3).tolist()] for part in views]
+        return digest(json.dumps(parts).encode())
 
     @property
     def name(self) -> str:

@@ -20,12 +20,13 @@ class StudyOptions(CommandOptions):
     style_images: Tuple[Path, ...]
     """Paintings; each is a table of its own."""
     output_path: Path
-    """The HTML page to write."""
+    """The HTML page to write; one of that name that says something else is kept with a number behind its name."""
     output_dir: Path = Path("outputs/studies")
     """Folder of the runs; those in it are used again. Keep other runs out of it: hier-style takes the newest coarse
     run below its --output-dir, and that must not be an ablation's."""
-    parser: str = "llff-data"
-    """nerfstudio's name of the scene's dataparser."""
+    parser: Optional[str] = None
+    """nerfstudio's name of the scene's dataparser, where its files don't tell, with its options behind it:
+    --parser='llff-data --eval-interval 4'."""
     max_image_side: Optional[int] = None
     """Longer side, in pixels, that photos are reduced to; None: the methods' own limit."""
     draft: bool = False
@@ -46,7 +47,7 @@ class StudyOptions(CommandOptions):
         other = replace(self, output_path=self.output_path.with_name("ablate.html"))
         command: List[object] = ["sparsestyle", "ablate", "--data", other.data, "--style-images", *other.style_images]
         command += ["--output-path", other.output_path]
-        for each in fields(other)[3:]:
+        for each in fields(StudyOptions)[3:]:
             value, flag = getattr(other, each.name), f"--{each.name.replace('_', '-')}"
             if value != each.default:
                 command.append(flag if value is True else f"{flag}={value}")
@@ -61,6 +62,9 @@ class CompareOptions(StudyOptions):
     the optical flow, fine-tuning the coarse field (ARF's kind), a FreeNeRF-style field fine-tuned, and ours.
     Interrupted, the same command goes on where it was.
     """
+
+    front: bool = False
+    """Draw style against kept content instead: several content weights of each way of stylising, all in equal time."""
 
 
 @dataclass
@@ -91,8 +95,8 @@ class TradeoffOptions(CommandOptions):
     """The painting; without it, what stylises is left out."""
     budget: str = "10m"
     """Time that it may take, such as 90s, 10m or 1h30m. More of it gives longer runs and more repetitions."""
-    output_dir: Path = Path("tradeoff")
-    """Folder of the report."""
+    output_dir: Optional[Path] = None
+    """Folder of the report; left out, tradeoff here, or tradeoff-2 where that is there already."""
     coarse_run: Optional[Path] = None
     """Folder of a coarse-fewshot run of this scene to render; left out, one is trained in a part of the time."""
     max_image_side: Optional[int] = None
@@ -111,3 +115,5 @@ class TradeoffOptions(CommandOptions):
     """File with the weights of VGG-16, as for ns-train."""
     backbone: Literal["auto", "vgg16", "vgg16-shift-tolerant"] = "auto"
     """Feature network, as for ns-train."""
+    force: bool = False
+    """Write over the report in the folder that --output-dir names, if there is one."""

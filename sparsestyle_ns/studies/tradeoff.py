@@ -3,6 +3,7 @@
 import gc
 import tempfile
 import warnings
+from dataclasses import replace
 from datetime import datetime, timezone
 from typing import Dict, List, Tuple
 
@@ -18,11 +19,13 @@ from sparsestyle_ns.studies.measure_training import StageRuns
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.studies.study_options import TradeoffOptions
 from sparsestyle_ns.studies.time_budget import Budget, Plan, parse_duration, run_plans
-from sparsestyle_ns.studies.tradeoff_report import GROUPS, Fact, Report, writing_to
+from sparsestyle_ns.studies.tradeoff_report import GROUPS, Fact, Report, report_folder, writing_to
 from sparsestyle_ns.studies.workbench import Workbench
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.interrupts import PRESSES, StoppedByCtrlC, stop
 from sparsestyle_ns.utils.machine import device_name, versions
 
+STOPPED = "Stopped by Ctrl-C; what was measured before is here."
 REPORT_SECONDS = 4.0
 REPORT_SHARE = 0.05
 """Time that is kept for writing the report: so many seconds, but no larger part of the budget."""
@@ -33,11 +36,11 @@ def tradeoff(options: TradeoffOptions) -> None:
     budget_seconds = parse_duration(options.budget)
     if options.rounds < 1:
         raise InputError(f"--rounds is {options.rounds}, but has to be at least 1.")
-    study = study_of(options)
+    study, options = study_of(options), replace(options, output_dir=report_folder(options.output_dir, options.force))
     try:
         report = measure(study, options, Budget(budget_seconds))
-    except KeyboardInterrupt:
-        raise SystemExit("Stopped before anything was measured.") from None
+    except PRESSES:
+        stop("Stopped by Ctrl-C before anything was measured.")
     page = report.write(options.output_dir)
     lines = report.recommendation or ["Nothing could be measured in the time there was; give a larger --budget."]
     left_out = report.everything_left_out()
@@ -46,6 +49,8 @@ def tradeoff(options: TradeoffOptions) -> None:
     Console().print(*lines, sep="\n", markup=False, highlight=False, soft_wrap=True)
     config = study.config("coarse-fewshot")
     finish(page.resolve(), ["ns-train", config.method_name, *scene_arguments(config)])
+    if STOPPED in report.left_out:
+        raise StoppedByCtrlC
 
 
 def study_of(options: TradeoffOptions) -> Study:
@@ -74,8 +79,8 @@ def measure(study: Study, options: TradeoffOptions, budget: Budget) -> Report:
 
         try:
             run_plans(plans, budget.part(budget.left - min(REPORT_SECONDS, REPORT_SHARE * seconds)), begin)
-        except KeyboardInterrupt:
-            stopped = ["Stopped by Ctrl-C; what was measured before is here."]
+        except PRESSES:
+            stopped = [STOPPED]
         finally:
             gc.unfreeze()
     curves = [curve for plan in plans for curve in plan.curves if curve.points or curve.left_out]

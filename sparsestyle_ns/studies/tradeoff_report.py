@@ -17,7 +17,7 @@ from sparsestyle_ns.studies.plots import curve_plot, overview
 from sparsestyle_ns.studies.study_options import Group
 from sparsestyle_ns.studies.study_page import Section, study_page
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.files import write_whole
+from sparsestyle_ns.utils.files import free_path, write_whole
 
 Fact = Union[str, float, Sequence[str], Mapping[str, str]]
 GROUPS: Dict[Group, str] = {
@@ -29,6 +29,8 @@ GROUPS: Dict[Group, str] = {
     "precision": "Precision",
 }
 """In the order of the page."""
+FILES = ("index.html", "tradeoff.json", "tradeoff.csv", "tradeoff.png")
+"""What a report's folder has."""
 COLUMNS = ("axis", "flag", "setting", "moment", "metric", *Spread._fields, "front", "recommended", "busy")
 LEGEND = (
     "Figures are medians, with the smallest and largest of as many repetitions as are named. A ring marks the "
@@ -86,6 +88,19 @@ class Report:
         facts = {name.replace("_", " "): in_a_line(value) for name, value in self.facts.items()}
         how = Section("How it was measured", LEGEND, facts=facts)
         return [Section("In short", lines=self.recommendation), *sections, *left_out, how]
+
+
+def report_folder(asked: Optional[Path], force: bool) -> Path:
+    """Where a new report goes; an `InputError` where one is there already that may not be lost."""
+    if asked is None:
+        return free_path(Path("tradeoff"))
+    there = [asked / name for name in FILES if (asked / name).exists()]
+    if there and not force:
+        raise InputError(
+            f"There is a report in --output-dir {asked} already ({there[0].name}); name another folder, such as "
+            f"{free_path(asked)}, or write over it with --force."
+        )
+    return asked
 
 
 @contextlib.contextmanager

@@ -7,13 +7,12 @@ from typing import Callable, Dict, List, Optional, Sequence, Tuple, TypeVar, Uni
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig, MultiStepSchedulerConfig
 from torch import Tensor
 
 from sparsestyle_ns.data.view_selection import evenly_spaced
 from sparsestyle_ns.effects.registry import decide
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
-from sparsestyle_ns.engine.training import Training, WarmUpSchedulerConfig
+from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.metrics.image import image_metrics
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
@@ -23,7 +22,6 @@ from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, HierStylePipe
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.pipelines.scene_views import SceneViews
 from sparsestyle_ns.runs.coarse_run import check_scene, read_coarse_run
-from sparsestyle_ns.runs.scene_record import record_scene
 from sparsestyle_ns.studies.curves import Curve, root_mean_square
 from sparsestyle_ns.studies.study import Study, flag_of, get_setting, with_setting
 from sparsestyle_ns.studies.study_options import Group
@@ -38,23 +36,12 @@ HELD_OUT_VIEWS = 3
 
 
 def squeezed(config: SparseStyleTrainerConfig, iterations: int) -> SparseStyleTrainerConfig:
-    """A copy of a method's config whose schedules end after `iterations` as they would have at the preset's end."""
+    """A copy of a method's config for another number of iterations, with as large a share of them of warm start."""
     config = copy.deepcopy(config)
-    share = iterations / config.max_num_iterations
-
-    def scaled(count: int) -> int:
-        return max(1, round(count * share))
-
-    config.max_num_iterations, pipeline = iterations, config.pipeline
-    for scheduler in (parts["scheduler"] for parts in config.optimizers.values()):
-        if isinstance(scheduler, ExponentialDecaySchedulerConfig):
-            scheduler.max_steps = scaled(scheduler.max_steps)
-        elif isinstance(scheduler, MultiStepSchedulerConfig):
-            scheduler.milestones = tuple(map(scaled, scheduler.milestones))
-        if isinstance(scheduler, WarmUpSchedulerConfig):
-            scheduler.warm_up = scaled(scheduler.warm_up)
-    if isinstance(pipeline, HierStylePipelineConfig):
-        pipeline.warm_start_steps = scaled(pipeline.warm_start_steps) if pipeline.warm_start_steps else 0
+    pipeline, share = config.pipeline, iterations / config.max_num_iterations
+    if isinstance(pipeline, HierStylePipelineConfig) and pipeline.warm_start_steps:
+        pipeline.warm_start_steps = max(1, round(pipeline.warm_start_steps * share))
+    config.max_num_iterations = iterations
     return config
 
 
@@ -114,7 +101,7 @@ class Workbench:
 
     def _adopt_coarse_run(self, folder: Path) -> None:
         run = read_coarse_run(folder)
-        check_scene(run, record_scene(self.study.data, self.manager.train_dataparser_outputs, self.effects))
+        check_scene(run, self.manager.record(self.effects))
         config = with_setting(self.coarse_config, "pipeline.model", run.config.pipeline.model)
         model = self._setup_pipeline(config).model
         model.load_state_dict(run.model_state())
@@ -157,8 +144,6 @@ class Workbench:
             pipeline.style = self.style
             if self.scene_views is None:
                 self.scene_views = pipeline.freeze_views()
-            for view in self.scene_views.views:
-                view.features = None  # they depend on the size that the network sees, which a run may change
             pipeline.scene_views = self.scene_views
 
         return Training(config, self.device, self.coarse_state, share)

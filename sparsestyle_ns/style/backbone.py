@@ -36,7 +36,7 @@ class Weights:
             return read_state(self.path)
         except ValueError as error:
             raise InputError(
-                f"The VGG weight file {self.path} is {error}: fetch it again, or give another with --vgg-weights."
+                f"The VGG weight file {self.path} is {error}", "fetch it again, or give another with --vgg-weights"
             ) from error
 
     def describe(self, name: str) -> BackboneDescription:

@@ -29,7 +29,7 @@ def load_backbone(name: str = "auto", weights: Optional[Path] = None) -> Backbon
             return kind.load(found, found.read())
         absent += f"; {kind.why_absent()}"
     ways = ", or ".join(kind.how_to_get() for kind in BACKBONES.values())
-    raise InputError(f"There are no weights for --backbone {name}: give a file with --vgg-weights, or {ways}.")
+    raise InputError(f"There are no weights for --backbone {name}", f"give a file with --vgg-weights, or {ways}")
 
 
 def available_backbone() -> Optional[str]:
@@ -39,10 +39,10 @@ def available_backbone() -> Optional[str]:
 
 def _load_file(name: str, path: Path) -> Backbone:
     if not path.is_file():
-        raise InputError(f"There is no VGG weight file {path}: check the path given as --vgg-weights.")
+        raise InputError(f"There is no VGG weight file {path}", "check the path given as --vgg-weights")
     weights = Weights(path, f"the file {path}, as asked for")
     state = weights.read()
     kind = next((kind for kind in BACKBONES.values() if kind.accepts(state)), VGG16)  # which says what is wrong
     if name not in ("auto", kind.name):
-        raise InputError(f"The weight file {path} is of {kind.name}, not of {name}: give another file or --backbone.")
+        raise InputError(f"The weight file {path} is of {kind.name}, not of {name}", "give another file or --backbone")
     return kind.load(weights, state)

@@ -5,14 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Union
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Shaped
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import digest
+from sparsestyle_ns.utils.pictures import decode, orientation_of
 
 SMALLEST_SIDE, THUMBNAIL_SIDE = 8, 200
 """Pixels: what each side of a painting must have, and the longer side of its thumbnail."""
@@ -29,6 +30,11 @@ class Painting:
     data: bytes
     pixels: Float[Tensor, "3 H W"]
     """RGB in [0, 1], float32, on the CPU, upright as its EXIF orientation says."""
+
+    @property
+    def digest(self) -> str:
+        """By which the file is known again."""
+        return digest(self.data)
 
     @classmethod
     def read(cls, path: Union[str, Path]) -> "Painting":
@@ -72,10 +78,7 @@ def _decode(data: bytes, name: Union[str, Path]) -> Float[Tensor, "3 H W"]:
         with Image.open(io.BytesIO(data)) as image:
             # Pillow can say what is wrong with a damaged file; OpenCV only that there is no image.
             image.load()
-            # Of 16 bits a channel in a PNG, whose header has the depth at byte 24, Pillow would keep 8.
-            is_deep = data.startswith(b"\x89PNG\r\n\x1a\n") and data[24] == 16
-            pixels = _to_rgb(_decode_deep_png(data) if is_deep else _decode_with_pillow(image))
-            pixels = _turn_upright(pixels, image.getexif().get(ExifTags.Base.Orientation, 1))
+            pixels = _turn_upright(_to_rgb(decode(image, data)), orientation_of(image))
     except UnidentifiedImageError as error:
         raise InputError(
             f"The style image {name} is in no known image format: give a JPEG, PNG or WebP file."
@@ -91,22 +94,6 @@ def _decode(data: bytes, name: Union[str, Path]) -> Float[Tensor, "3 H W"]:
             f"The style image {name} is {width} × {height} pixels: give one of at least {SMALLEST_SIDE} pixels a side."
         )
     return torch.from_numpy(pixels).permute(2, 0, 1).contiguous().clamp(0, 1)
-
-
-def _decode_deep_png(data: bytes) -> Shaped[np.ndarray, "H W channels"]:
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        raise ValueError("its 16-bit PNG data cannot be decoded")
-    to_rgb = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
-    return cv2.cvtColor(pixels, to_rgb[1 if pixels.ndim == 2 else pixels.shape[2]])
-
-
-def _decode_with_pillow(image: Image.Image) -> Shaped[np.ndarray, "H W channels"]:
-    if image.mode.startswith("I;16"):
-        return np.repeat(np.asarray(image).astype(np.uint16)[..., None], 3, axis=2)
-    if image.mode in ("I", "F"):
-        raise ValueError(f"pixels of the kind {image.mode} have no fixed range")
-    return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
 
 
 def _to_rgb(pixels: Shaped[np.ndarray, "H W channels"]) -> Float[np.ndarray, "H W 3"]:

@@ -17,6 +17,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 from torch.multiprocessing.spawn import ProcessExitedException
 
+from sparsestyle_ns.utils.interrupts import end_on_ctrl_c
+
 T = TypeVar("T")
 
 
@@ -104,7 +106,7 @@ def prepare_launch() -> None:
         if settings["num_devices_per_machine"] * settings["num_machines"] == 1:
             return nerfstudio_launch(**settings)
         former = signal.signal(signal.SIGINT, signal.SIG_IGN)  # each process handles Ctrl-C itself
-        script._distributed_worker = _work_on_cpu if settings["device_type"] == "cpu" else nerfstudio_worker
+        script._distributed_worker = _work_on_cpu if settings["device_type"] == "cpu" else _work_on_gpu
         try:
             nerfstudio_launch(**settings)
         except ProcessExitedException as error:
@@ -116,12 +118,26 @@ def prepare_launch() -> None:
     script.launch = launch
 
 
+def _handle_ctrl_c() -> None:
+    """Undoes what the process that waits for this one has set for itself."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    end_on_ctrl_c()
+
+
+def _work_on_gpu(*settings: Any) -> None:
+    """What one of the processes does: nerfstudio's `_distributed_worker`."""
+    from nerfstudio.scripts.train import _distributed_worker
+
+    _handle_ctrl_c()
+    _distributed_worker(*settings)
+
+
 def _work_on_cpu(
     local_rank: int, main: Callable[..., None], world_size: int, per_machine: int, machine: int, url: str, *rest: Any
 ) -> None:
     """What one of the processes does: nerfstudio's `_distributed_worker`, without CUDA."""
     config, timeout, _ = rest
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    _handle_ctrl_c()
     rank = machine * per_machine + local_rank
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(max(1, (os.cpu_count() or 1) // per_machine))

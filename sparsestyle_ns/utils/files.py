@@ -1,5 +1,6 @@
 """Files: written whole or not at all, with names that are fit for any disk and told apart."""
 
+import hashlib
 import os
 import re
 import tempfile
@@ -41,13 +42,46 @@ def write_whole(
     return target
 
 
-def prepare_output(output_path: Path, what: str, example: str) -> None:
+def digest(*contents: bytes) -> str:
+    """Sixteen hexadecimal digits by which the contents of files are known again."""
+    total = hashlib.sha256()
+    for content in contents:
+        total.update(content)
+    return total.hexdigest()[:16]
+
+
+def free_path(path: Path) -> Path:
+    """A path at which nothing is yet: this, else with a number behind the name."""
+    found, number = path, 2
+    while found.exists():
+        found, number = path.with_name(f"{path.stem}-{number}{path.suffix}"), number + 1
+    return found
+
+
+def keep_former(path: Path, content: str) -> Optional[Path]:
+    """Gives a file another name, says so and returns it, if its content isn't the one that takes its place."""
+    if not path.is_file() or path.read_text(encoding="utf-8", errors="replace") == content:
+        return None
+    from sparsestyle_ns.utils.progress import say  # loads torch, for which checks of options have no time
+
+    former = path.rename(free_path(path))
+    say(f"What {path} said before is kept as {former}.")
+    return former
+
+
+def prepare_output(output_path: Path, what: str, example: str, force: bool = False) -> None:
     """Makes the folder of a file that a command is to write; an `InputError` where that file can't be written.
 
-    Its sentence calls the file `what`; `example` is a good name for it.
+    So it is where there is such a file already, unless `force` says that it may be lost. The sentence calls the file
+    `what`; `example` is a good name for it.
     """
     if output_path.is_dir():
         raise InputError(f"--output-path {output_path} is a folder; name a file, such as {output_path / example}.")
+    if output_path.exists() and not force:
+        raise InputError(
+            f"--output-path {output_path} is there already; name another file, such as {free_path(output_path)}, or "
+            "write over it with --force."
+        )
     try:
         output_path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=output_path.parent):
@@ -57,8 +91,11 @@ def prepare_output(output_path: Path, what: str, example: str) -> None:
 
 
 def write_output(output_path: Path, content: Union[str, bytes], what: str, example: str) -> Path:
-    """Writes a file as `write_whole` does, and returns its absolute path; arguments and errors of `prepare_output`."""
-    prepare_output(output_path, what, example)
+    """Writes a file as `write_whole` does, and returns its absolute path; arguments and errors of `prepare_output`.
+
+    Whether it may be written was settled by that function, before the work began.
+    """
+    prepare_output(output_path, what, example, force=True)
     try:
         return write_whole(output_path, content).resolve()
     except OSError as error:

@@ -12,6 +12,7 @@ from viser import GuiApi
 
 from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
 from sparsestyle_ns.fields.fine import StylisedField
+from sparsestyle_ns.pipelines.hier_style import STROKE_SIZES
 from sparsestyle_ns.runs.run_folder import read_config
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
@@ -42,6 +43,8 @@ def error_text(error: Exception) -> str:
 
 def in_one_line(error: Exception) -> str:
     """An error's message without line breaks, or its kind where it has none."""
+    if isinstance(error, InputError):
+        return f"{error.fault}."  # what is kept apart from it is advice to one who types commands
     return " ".join(str(error).split()) or type(error).__name__
 
 
@@ -79,15 +82,17 @@ class RestylingControls:
         self.workshop: Optional[Workshop] = None
         self.thread: Optional[threading.Thread] = None
         self._stopping, self._busy, self._pace = threading.Event(), threading.Lock(), Pace()
-        iterations, said = 0, ""
+        iterations, stroke_size, said = 0, 1.0, ""
         try:
             self.workshop = open_workshop()
-            iterations = read_config(self.workshop.folder).max_num_iterations
+            config = read_config(self.workshop.folder)
+            iterations, stroke_size = config.max_num_iterations, config.pipeline.stroke_size
         except InputError as error:
             said = f"**No restyling.** {plain(str(error))}"
         with gui.add_folder("Another style", expand_by_default=False):
             self.path = gui.add_text("Image", "", hint="path of a picture on the machine that the viewer runs on")
             self.iterations = gui.add_number("Iterations", iterations)
+            self.stroke_size = gui.add_slider("Stroke size", *STROKE_SIZES, step=0.1, initial_value=stroke_size)
             gui.add_button("Restyle").on_click(lambda _: self.restyle_path())
             upload = gui.add_upload_button("Upload and restyle", mime_type="image/*")
             upload.on_upload(lambda event: self.restyle_upload(event.target.value.name, event.target.value.content))
@@ -130,7 +135,7 @@ class RestylingControls:
                 raise InputError("This run can't be restyled in this viewer.")
             if not self.is_prepared():
                 raise InputError("The scene is still being prepared for training; try again when it has begun.")
-            restyling = Restyling(self.workshop, painting, int(self.iterations.value))
+            restyling = Restyling(self.workshop, painting, int(self.iterations.value), self.stroke_size.value)
         except Exception as error:  # whatever it is, the viewer goes on
             self._busy.release()
             self.end(f"**Not restyled.** {plain(error_text(error))}")

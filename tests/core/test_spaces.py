@@ -276,3 +276,30 @@ def test_a_camera_that_has_flown_into_a_forward_facing_scene_sees_what_is_ahead_
     torch.testing.assert_close(start, torch.tensor([1.5, 0.0, 0.0]), rtol=0, atol=1e-4)
     torch.testing.assert_close(end, torch.tensor([9.0, 6.0, 0.0]), rtol=0, atol=1e-4)
     assert segments.hit.tolist() == [True, True, False]  # the last one has the whole scene behind it
+
+
+@pytest.mark.parametrize(("near", "far"), [(0.0, 1e6), (1.5, 3.0), (2.0, 2.5), (3.0, 2.0), (1e10, 1e10)])
+def test_a_part_between_two_distances_is_all_of_the_ray_that_lies_there(scene, near, far):
+    space, origins, directions, _ = scene
+    segments = space.segments(origins, directions)
+    part = segments.between(torch.full((RAYS, 1), near), torch.full((RAYS, 1), far))
+    s = torch.linspace(0, 1, 9).expand(RAYS, -1)
+    # A distance is met where the whole segment has it, so the same points have the same positions in the cube.
+    at = torch.cat([segments.at_distance(part.distance(column[:, None])) for column in s.T], dim=-1)
+    torch.testing.assert_close(part.positions(s)[part.hit], segments.positions(at)[part.hit], atol=2e-3, rtol=0)
+    start, end = (part.distance(torch.full((RAYS, 1), side))[part.hit] for side in (0.0, 1.0))
+    assert ((start >= near * (1 - 1e-3) - 1e-3) & (end <= far * (1 + 1e-2) + 1e-3)).all()
+    reach = [segments.distance(torch.full((RAYS, 1), side)).squeeze(-1) for side in (0.0, 1.0)]
+    inside = segments.hit & (reach[0] < far - 0.1) & (reach[1] > near + 0.1) & (far > near)
+    assert part.hit[inside].all()
+    assert not part.hit[~segments.hit].any()
+    lengths = part.lengths(s)
+    assert (lengths >= 0).all() and torch.isfinite(lengths).all()
+
+
+def test_packed_positions_of_a_part_are_the_dense_ones(scene):
+    space, origins, directions, _ = scene
+    part = space.segments(origins, directions).between(torch.full((RAYS, 1), 1.5), torch.full((RAYS, 1), 4.0))
+    s = torch.rand(RAYS, 5, generator=torch.Generator().manual_seed(3))
+    ray_indices = torch.arange(RAYS).repeat_interleave(5)
+    torch.testing.assert_close(part.positions(s.flatten(), ray_indices), part.positions(s).flatten(0, 1))

@@ -90,9 +90,9 @@ def server():
 def fails(tmp_path, capsys):
     """Runs a fetch that has to fail, checks that it does so cleanly, and returns what it says."""
 
-    def run(*arguments, main=fetch_llff.main, output=tmp_path / "data"):
+    def run(*arguments, main=fetch_llff.main, output=tmp_path / "data", status=1):
         before = contents(tmp_path)
-        assert main([str(output), *arguments]) == 1
+        assert main([str(output), *arguments]) == status
         captured = capsys.readouterr()
         assert captured.out == ""
         assert captured.err.startswith("Error: ")
@@ -263,7 +263,7 @@ def test_an_interruption_leaves_nothing_behind(tmp_path, fails, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(_download, "unpack_scene", interrupt)
-    assert "Interrupted" in fails("--url", write(tmp_path / "good.zip", LLFF_ZIP))
+    assert "Interrupted" in fails("--url", write(tmp_path / "good.zip", LLFF_ZIP), status=130)
 
 
 def test_a_timeout_of_nothing_is_refused(tmp_path, capsys):

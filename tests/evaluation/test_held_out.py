@@ -9,8 +9,9 @@ from conftest import run_entrypoint
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.engine.loading import evaluate_run, load_run
-from sparsestyle_ns.evaluation.held_out import by_figure, saved_report
+from sparsestyle_ns.evaluation.held_out import StyleFigures, by_figure, saved_report
 from sparsestyle_ns.evaluation.tables import report_tables
+from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 from sparsestyle_ns.runs.run_folder import find_config
 
 
@@ -52,6 +53,14 @@ def test_a_stylised_run_is_measured_for_truth_consistency_style_and_content(runs
             assert f"{part}_{kind}" in means and f"ceiling_{part}_{kind}" in means
     assert means["short_visible"] >= means["long_visible"]
     assert means["ceiling_short_rmse"] <= means["ceiling_long_rmse"]
+
+
+def test_the_painting_itself_uses_all_of_its_features_and_a_flat_picture_hardly_any(painting: Path) -> None:
+    settings = HierStylePipelineConfig(style_image=painting)
+    targets = settings.targets_of(*settings.load_style(), torch.device("cpu"), 48)
+    picture, figures = targets.style_picture.permute(1, 2, 0), StyleFigures(targets)
+    assert figures.of(picture, picture, None)["features_used"] == pytest.approx(1.0, abs=0.02)
+    assert figures.of(picture, torch.full_like(picture, 0.5), None)["features_used"] < 0.3
 
 
 def test_ns_eval_gives_the_same_figures(runs: SimpleNamespace, tmp_path: Path) -> None:

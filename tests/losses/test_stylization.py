@@ -18,7 +18,7 @@ class Patches(nn.Module):
 
 def make_targets():
     torch.manual_seed(0)
-    return StyleTargets(Patches(), torch.rand(3, 16, 16), feature_side=16, style_side=16)
+    return StyleTargets(Patches(), torch.rand(3, 16, 16), feature_side=16)
 
 
 def test_fit_side_makes_the_longer_side_as_asked_and_keeps_the_proportions():
@@ -56,7 +56,7 @@ def test_with_few_style_features_the_loss_is_that_against_some_of_the_painting()
     picture, image = torch.rand(3, 16, 16), torch.rand(16, 16, 3)
     losses = []
     for count in (None, 16, 4, 1):
-        targets = StyleTargets(Patches(), picture, 16, 16, style_features=count)
+        targets = StyleTargets(Patches(), picture, 16, style_features=count)
         losses.append(float(targets.losses(targets.view(image, targets.features(image)))["style"]))
     assert losses[0] == losses[1]  # there are 16 in all
     assert losses[1] < losses[2] < losses[3]

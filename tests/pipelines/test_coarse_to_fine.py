@@ -1,6 +1,8 @@
 """Stage 2's training: views from small to large, and what counts at which of their sizes."""
 
 import copy
+import math
+import shutil
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -134,6 +136,27 @@ def test_the_painting_and_the_views_are_seen_at_sizes_that_belong_together(train
     assert training.pipeline.targets is large.targets
 
 
+@pytest.mark.parametrize("size, side", [(0.5, 252), (1.0, 126), (2.0, 63)])
+def test_wider_strokes_come_of_smaller_pictures_for_the_network(size, side):
+    config = HierStylePipelineConfig(stroke_size=size)
+    assert config.side_at(0.5, 252) == side
+    assert config.side_at(1.0, 252) == 2 * side
+
+
+@pytest.mark.parametrize("size", [0.0, 0.49, 2.1, math.nan])
+def test_strokes_beyond_half_and_twice_are_refused(size, painting):
+    with pytest.raises(InputError, match=r"--stroke-size is .*; give a number from 0.5 to 2\."):
+        HierStylePipelineConfig(stroke_size=size, style_image=painting).load_style()
+
+
+def test_the_style_counts_more_for_an_object_on_a_background(training, monkeypatch):
+    pipeline = training.pipeline
+    _, everywhere = pipeline.losses(pipeline.task, 0)
+    monkeypatch.setattr(pipeline.model, "background", torch.ones(3))
+    _, of_object = pipeline.losses(pipeline.task, 0)
+    assert of_object.weights == {**everywhere.weights, "style": 4.0 * everywhere.weights["style"]}
+
+
 def test_restyling_goes_through_the_same_sizes(training, runs, painting, monkeypatch):
     pipeline = training.pipeline
     seen, losses = [], type(pipeline).losses
@@ -149,3 +172,21 @@ def test_restyling_goes_through_the_same_sizes(training, runs, painting, monkeyp
     assert list(restyling)[-1].done == 1.0
     assert seen == [(11, 14)] * 3 + [(24, 32)] * 2
     assert pipeline.scene_views is before
+
+
+def test_a_restyling_with_wider_strokes_leaves_the_other_styles_features_alone(training, runs, painting):
+    pipeline, own = training.pipeline, training.pipeline.task.levels[-1]
+    before = [view.features.clone() for view in own.views]
+    workshop, image = Workshop(pipeline, runs.style, nullcontext()), Painting.read(painting)
+    restyling = Restyling(workshop, image, iterations=5, stroke_size=2.0)
+    new = pipeline.new_task(restyling.field, image, workshop.backbone, pipeline.effects, 5, restyling.stroke_size)
+    assert new.levels[-1].targets.feature_side == own.targets.feature_side // 2
+    for old, view, features in zip(own.views, new.levels[-1].views, before, strict=True):
+        assert torch.equal(old.features, features)
+        assert view.features.shape[-1] < features.shape[-1]
+    assert list(restyling)[-1].done == 1.0
+    folder = restyling.save()
+    try:
+        assert load_run(folder / "config.yml").config.pipeline.stroke_size == 2.0
+    finally:
+        shutil.rmtree(folder)

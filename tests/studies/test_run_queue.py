@@ -192,7 +192,9 @@ def test_a_training_process_reports_why_it_failed(
     assert ProgressReport.read(tmp_path / "progress.json").failure == sentence
 
 
-def test_after_ctrl_c_nothing_more_is_begun(queue: RunQueue, coarse: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_ctrl_c_nothing_more_is_begun(
+    queue: RunQueue, coarse: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
     begun = []
 
     def interrupt(self: RunQueue, run: Run, *_: object) -> None:
@@ -200,8 +202,10 @@ def test_after_ctrl_c_nothing_more_is_begun(queue: RunQueue, coarse: Run, monkey
         raise KeyboardInterrupt
 
     monkeypatch.setattr(RunQueue, "_train", interrupt)
-    with pytest.raises(InputError, match="goes on where it was"):
+    with pytest.raises(SystemExit) as ended:
         queue.train([replace(coarse, name=str(number)) for number in range(8)])
+    assert ended.value.code == 130
+    assert "Stopped by Ctrl-C; the same command goes on where it was." in capsys.readouterr().err
     assert begun == ["0"]
 
 

@@ -17,8 +17,9 @@ from sparsestyle_ns import cli
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.engine.previews import preview_path
+from sparsestyle_ns.evaluation.tables import LABELS
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
-from sparsestyle_ns.studies import paper_studies, run_figures
+from sparsestyle_ns.studies import front, paper_studies, run_figures
 from sparsestyle_ns.studies.paper_runs import COARSE_KINDS, STYLE_KINDS, PaperRuns
 from sparsestyle_ns.studies.paper_studies import (
     OF_METHODS,
@@ -205,6 +206,39 @@ def test_compare_trains_what_is_missing_measures_each_row_and_writes_the_page(
     page = (tmp_path / "compare.html").read_text()
     assert shown("isn't installed") in page
     assert not any(shown(name) in page for name in ROWS_OF_2D.values())
+
+
+def test_compare_draws_style_against_content_in_equal_time(
+    llff_scene: Path, painting: Path, tmp_path: Path, train_here: list, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(front, "can_transfer", lambda: True)
+    monkeypatch.setattr(front, "transfer_frames", lambda frames, painting: [1.0 - frame for frame in frames])
+    kinds = ("ours", "arf")
+    monkeypatch.setattr(front, "PROBE_ITERATIONS", 4)
+    monkeypatch.setattr(front, "CONTENT_WEIGHTS", dict.fromkeys(kinds, (0.1, 1.0)))
+    monkeypatch.setattr(front, "KINDS", {name: front.KINDS[name] for name in (front.OURS, front.ARF)})
+    main([*arguments("compare", llff_scene, painting, tmp_path, 4), "--front"])
+    assert set(train_here) == {"ours", *(f"ours-{kind}-painting-{weight}" for kind in kinds for weight in ("0.1", "1"))}
+    page = (tmp_path / "compare.html").read_text()
+    for kind in (*front.KINDS, front.FRAME_BY_FRAME):
+        assert shown(kind) in page
+    for distance in front.DISTANCES:
+        assert shown(LABELS[distance][0]) in page
+
+
+def points_of(kind: str, *pairs: tuple) -> list:
+    return [
+        front.FrontPoint(kind, 1.0, run_figures.RunFigures({front.KEPT: kept, "style_loss": loss}, []))
+        for kept, loss in pairs
+    ]
+
+
+def test_a_front_is_read_between_its_points_and_not_beyond() -> None:
+    points = points_of("ours", (0.7, 0.3), (0.3, 0.1), (0.5, 0.2)) + points_of("other", (0.4, 9.0))
+    found = [front.at_kept(points, "ours", "style_loss", kept) for kept in (0.2, 0.3, 0.4, 0.6, 0.7, 0.8)]
+    assert found == [None, *map(pytest.approx, (0.1, 0.15, 0.25, 0.3)), None]
+    assert front.at_kept(points, "other", "style_loss", 0.4) == 9.0
+    assert front.at_kept(points, "none", "style_loss", 0.4) is None
 
 
 def test_figures_are_measured_again_when_a_run_has_gone_on(

@@ -4,6 +4,7 @@ import signal
 import socket
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Callable
@@ -15,6 +16,7 @@ from conftest import TINY_STYLE, ns_train
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.engine.style_trainer import HierStyleTrainer
 from sparsestyle_ns.runs.checkpoints import newest_checkpoint
+from sparsestyle_ns.utils.interrupts import StoppedByCtrlC
 
 
 def train_with_viewer(
@@ -57,7 +59,8 @@ def train_with_viewer(
     flags = ["--style-image", str(painting), "--coarse-run", str(runs.coarse), *TINY_STYLE, *viewer]
     flags += ["--max-num-iterations", str(iterations), "--vis", "viewer+tensorboard"]
     try:
-        ns_train("hier-style", scene, outputs, *flags)
+        with suppress(StoppedByCtrlC):
+            ns_train("hier-style", scene, outputs, *flags)
     finally:
         for trainer in seen:
             trainer.viewer_state.viser_server.stop()

@@ -1,0 +1,136 @@
+"""Ctrl-C in a command: one sentence on stderr and exit status 130, wherever it comes; what was half made goes away.
+
+`sparsestyle` is guarded from its first line. nerfstudio's commands are guarded from when they load this package: they
+swallow a `KeyboardInterrupt`, print its traceback, and end with status 0. Python code that calls this package is left
+alone, and gets `KeyboardInterrupt` as ever.
+"""
+
+import atexit
+import os
+import re
+import signal
+import sys
+import threading
+import time
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import Callable, Iterator, List, NoReturn, Optional, Tuple
+
+STATUS = 130
+"""Exit status after Ctrl-C, as shells have it: 128 and the signal's number."""
+SENTENCE = "Stopped by Ctrl-C."
+SECONDS_OF_GRACE = 5.0
+"""After Ctrl-C what is half made is taken away; to press it again ends the process at once only after so long."""
+NS_COMMANDS = {"train": "train", "render": "render", "eval": "eval", "exporter": "export", "run_viewer": "viewer"}
+"""nerfstudio's modules of commands, and the commands' names behind `ns-`."""
+
+_pressed_at: Optional[float] = None
+_is_said = False
+_leftovers: List[Callable[[], object]] = []
+
+
+class StoppedByCtrlC(SystemExit):
+    """The user has pressed Ctrl-C, and the process is on its way to its end, with status 130."""
+
+    def __init__(self) -> None:
+        super().__init__(STATUS)
+
+
+PRESSES = (KeyboardInterrupt, StoppedByCtrlC)
+"""What Ctrl-C raises, without and with the guard."""
+
+
+def stop(sentence: str) -> NoReturn:
+    """Ends the process after Ctrl-C with a sentence of its own."""
+    global _is_said
+    _is_said = False
+    _say(sentence)
+    raise StoppedByCtrlC from None
+
+
+def end_on_ctrl_c() -> None:
+    """Guards this process, a command, until its end; nothing where somebody else handles Ctrl-C, or ignores it."""
+    is_free = threading.current_thread() is threading.main_thread()
+    if is_free and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _on_press)
+        atexit.register(lambda: None if _pressed_at is None else _say(SENTENCE))  # once all has come to its end
+
+
+@contextmanager
+def ended_by_ctrl_c() -> Iterator[None]:
+    """Ctrl-C within it ends the process as in one that is guarded, also where none is, as where Python calls it."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        stop(SENTENCE)
+
+
+def take_away_at_end(leftover: Callable[[], object]) -> None:
+    """Calls a function at the end of the process, also where a second Ctrl-C ends it at once."""
+    _leftovers.append(leftover)
+    atexit.register(leftover)
+
+
+def guard_nerfstudio(methods: Tuple[str, ...]) -> None:
+    """Guards this process if it is a command of nerfstudio's on a method, or a run, whose name starts with these."""
+    command = ns_command()
+    is_asked_for = command == "train" and any(word.startswith(methods) for word in sys.argv[1:])
+    if is_asked_for or (command is not None and _run_is_of(methods)):
+        end_on_ctrl_c()
+
+
+def ns_command() -> Optional[str]:
+    """Which command of nerfstudio's this process is, such as train of ns-train; None where it is none."""
+    name = Path(sys.argv[0]).stem
+    if name.startswith("ns-"):
+        return name.removeprefix("ns-")
+    if name == "-c":  # a script of one line
+        found = [each for each in NS_COMMANDS if _is_loaded(each)]
+        return NS_COMMANDS[found[0]] if len(found) == 1 else None
+    return NS_COMMANDS.get(name) if "nerfstudio" in Path(sys.argv[0]).parts else None
+
+
+def _is_loaded(module: str) -> bool:
+    return any(name.startswith("nerfstudio.scripts.") and name.endswith("." + module) for name in sys.modules)
+
+
+def ns_option(name: str, default: Optional[str] = None) -> Optional[str]:
+    """What this process's command line says of a flag, given without its dashes; the last, where it does so twice."""
+    found, words = default, sys.argv[1:]
+    for word, following in zip(words, [*words[1:], None], strict=False):
+        flag, is_joined, value = word.partition("=")
+        if flag.startswith("--") and flag[2:].replace("_", "-") == name:
+            found = value if is_joined else following
+    return found
+
+
+def _run_is_of(methods: Tuple[str, ...]) -> bool:
+    """Whether --load-config names a run of such a method."""
+    config = ns_option("load-config")
+    text = ""
+    with suppress(OSError):
+        text = "" if config is None else Path(config).read_text(encoding="utf-8", errors="replace")
+    found = re.search(r"^method_name: *(\S+)", text, flags=re.MULTILINE)
+    return found is not None and found[1].startswith(methods)
+
+
+def _on_press(number: int, frame: Optional[FrameType]) -> None:
+    global _pressed_at
+    if _pressed_at is None:
+        _pressed_at = time.monotonic()
+        raise StoppedByCtrlC
+    if time.monotonic() - _pressed_at > SECONDS_OF_GRACE:
+        for leftover in _leftovers:
+            with suppress(Exception):
+                leftover()
+        _say(SENTENCE)
+        os._exit(STATUS)
+
+
+def _say(sentence: str) -> None:
+    global _is_said
+    if not _is_said:
+        _is_said = True
+        with suppress(OSError, ValueError):  # stderr may be closed by now
+            print(sentence, file=sys.stderr, flush=True)

@@ -1,0 +1,262 @@
+"""What a command saved stays: another one takes a new name, or is told that what is there may be lost."""
+
+import contextlib
+import copy
+import json
+import re
+import shlex
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Dict, List
+
+import pytest
+from conftest import TINY, TINY_STYLE, ns_train, run_entrypoint
+from test_commands import press_ctrl_c_at
+from test_other_data import files_below, ns_command, refused
+
+from sparsestyle_ns.cli import main
+from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.studies.study_options import CompareOptions
+from sparsestyle_ns.studies.tradeoff_report import report_folder
+from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import free_path
+
+pytestmark = pytest.mark.usefixtures("quick_reports")
+
+
+@pytest.fixture
+def run(runs: SimpleNamespace, tmp_path: Path) -> Path:
+    """A coarse run of three iterations, named `first`, below `tmp_path`."""
+    import yaml
+
+    folder = shutil.copytree(runs.coarse, tmp_path / "llff" / "coarse-fewshot" / "first")
+    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+    config.output_dir, config.timestamp = tmp_path, "first"
+    (folder / "config.yml").write_text(yaml.dump(config))
+    return folder
+
+
+def steps(folder: Path) -> List[int]:
+    """Iterations of the checkpoints in a run's folder."""
+    return sorted(map(checkpoint_step, (folder / "nerfstudio_models").glob("*.ckpt")))
+
+
+def train_again(run: Path, scene: Path, *flags: str) -> None:
+    ns_train("coarse-fewshot", scene, run.parents[2], "--timestamp", "first", *TINY, *flags)
+
+
+def load_config(run: Path) -> None:
+    """`ns-train coarse-fewshot --load-config` of a run, without a viewer."""
+    from nerfstudio.scripts import train
+
+    run_entrypoint(train.entrypoint, ["coarse-fewshot", "--load-config", str(run / "config.yml")])
+
+
+@pytest.mark.parametrize("iterations", ["2", "3", "5"])
+def test_a_run_never_takes_the_folder_of_another(run: Path, llff_scene: Path, iterations: str) -> None:
+    before = files_below(run)
+    with pytest.raises(SystemExit, match=r"There is a run in .*first already; name a new one with --timestamp, or"):
+        train_again(run, llff_scene, "--max-num-iterations", iterations)
+    assert files_below(run) == before
+
+
+def test_what_is_said_of_a_taken_folder_can_be_done(run: Path, llff_scene: Path) -> None:
+    with pytest.raises(SystemExit) as ended:
+        train_again(run, llff_scene, "--max-num-iterations", "5")
+    (resume,) = re.findall("by (--load-dir .*)[.]$", str(ended.value.code))
+    train_again(run, llff_scene, "--max-num-iterations", "5", *shlex.split(resume))
+    assert steps(run) == [2, 4]  # it goes on in the same folder, and what was there stays
+    ns_train(
+        *("coarse-fewshot", llff_scene, run.parents[2], "--timestamp", "second", "--max-num-iterations", "1"), *TINY
+    )
+    assert steps(run.with_name("second")) == [0]
+
+
+@pytest.mark.parametrize("flags", [["--num-views", "2"], ["--max-num-iterations", "3"], ["--previews", "2"]])
+def test_a_run_that_isnt_gone_on_with_stays_as_it_is(run: Path, llff_scene: Path, flags: List[str]) -> None:
+    before = files_below(run)
+    with pytest.raises(SystemExit, match="Error: "):
+        train_again(run, llff_scene, "--load-dir", str(run / "nerfstudio_models"), *flags)
+    assert files_below(run) == before
+
+
+def test_a_run_isnt_gone_on_with_from_before_its_newest_checkpoint_in_its_own_folder(
+    run: Path, llff_scene: Path
+) -> None:
+    """What would be the newest checkpoint then would be of the former run."""
+    models = run / "nerfstudio_models"
+    shutil.copy(models / "step-000000002.ckpt", models / "step-000000009.ckpt")
+    resume = ["--load-dir", str(models), "--load-step", "2", "--max-num-iterations", "5"]
+    with pytest.raises(SystemExit, match="There is a run in"):
+        train_again(run, llff_scene, *resume)
+    ns_train("coarse-fewshot", llff_scene, run.parents[2], *resume, *TINY)
+    (new,) = (folder for folder in run.parent.iterdir() if folder != run)
+    assert steps(run) == [2, 9] and steps(new) == [4]
+    ns_command("ns-eval", "--load-config", new / "config.yml", "--output-path", run.parents[2] / "a.json")
+
+
+def test_the_config_of_a_finished_run_begins_another_one(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    before = files_below(run)
+    with monkeypatch.context() as patch, contextlib.suppress(SystemExit):
+        press_ctrl_c_at(patch, step=1)
+        load_config(run)
+    assert files_below(run) == before
+    (new,) = (folder for folder in run.parent.iterdir() if folder != run)
+    assert steps(new) == [1]
+    printed = capsys.readouterr().out
+    assert f"The run {run} is finished and stays as it is; this is a new one, {new}." in " ".join(printed.split())
+    command = shlex.split(printed.splitlines()[-1].split(" – next: ")[1])
+    assert command == ["ns-train", "coarse-fewshot", "--load-config", str(new / "config.yml")]
+    load_config(new)  # which that command does
+    assert steps(new) == [1, 2]
+    assert files_below(run) == before
+
+
+def test_runs_that_begin_in_one_second_have_folders_of_their_own(tmp_path: Path) -> None:
+    from sparsestyle_ns.method_configs import method_config
+
+    names = []
+    for _ in range(2):
+        config = copy.deepcopy(method_config("coarse-fewshot"))
+        config.output_dir, config.data, config.timestamp = tmp_path, Path("fern"), "{timestamp}"
+        config.set_timestamp()
+        config.get_base_dir().mkdir(parents=True)
+        names.append(config.timestamp)
+    assert len(set(names)) == 2
+
+
+def test_a_report_of_something_else_is_kept_under_another_name(run: Path, capsys: pytest.CaptureFixture) -> None:
+    (run / "evaluation.json").write_text("mine")
+    main(["evaluate", str(run)])
+    assert (run / "evaluation-2.json").read_text() == "mine"
+    assert f"kept as {run / 'evaluation-2.json'}" in " ".join(capsys.readouterr().out.split())
+    report = (run / "evaluation.json").read_text()
+    main(["evaluate", str(run)])  # says the same again, so nothing is lost
+    assert (run / "evaluation.json").read_text() == report
+    assert not (run / "evaluation-3.json").exists()
+
+
+def outputs_of(runs: SimpleNamespace, target: Path) -> Dict[str, List[str]]:
+    """Commands that write a file, by what they are."""
+    few = ["--num-views", "1", "--frames", "0"]
+    return {
+        "report": ["evaluate", str(runs.coarse), "--output-path", str(target)],
+        "gallery": ["gallery", str(runs.style), "--output-path", str(target), *few],
+        "points": ["export", str(runs.style), "--format", "ply", "--output-path", str(target)],
+        "page": ["export", str(runs.style), "--output-path", str(target)],
+    }
+
+
+@pytest.mark.parametrize("what", ["report", "gallery", "points", "page"])
+def test_a_file_that_is_there_is_written_over_only_where_that_is_asked_for(
+    runs: SimpleNamespace, tmp_path: Path, what: str
+) -> None:
+    target = tmp_path / "made.html"
+    target.write_text("mine")
+    arguments = outputs_of(runs, target)[what]
+    message = refused(arguments)
+    other = tmp_path / "made-2.html"
+    assert message.endswith(f"is there already; name another file, such as {other}, or write over it with --force.")
+    assert target.read_text() == "mine"
+    if what != "page":  # which takes longer, and is written by the same function
+        main([str(other) if part == str(target) else part for part in arguments])
+        assert other.exists() and target.read_text() == "mine"
+        main([*arguments, "--force"])
+        assert target.read_text(errors="replace") != "mine"
+
+
+def test_a_gallery_without_a_name_gets_one_of_its_own(
+    runs: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("gallery.html", "scene.html"):
+        Path(name).write_text("mine")
+    main(["gallery", str(runs.style), "--num-views", "1", "--frames", "0"])
+    assert Path("gallery.html").read_text() == "mine" and Path("gallery-2.html").is_file()
+    assert capsys.readouterr().out.splitlines()[-1].endswith("--output-path scene-2.html")
+
+
+def test_a_tradeoff_report_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert report_folder(None, force=False) == Path("tradeoff")
+    (tmp_path / "tradeoff").mkdir()
+    (tmp_path / "tradeoff" / "tradeoff.csv").touch()
+    assert report_folder(None, force=False) == Path("tradeoff-2")
+    with pytest.raises(InputError, match=r"tradeoff already .*such as tradeoff-2, or write over it with --force"):
+        report_folder(Path("tradeoff"), force=False)
+    assert report_folder(Path("tradeoff"), force=True) == Path("tradeoff")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").touch()
+    assert report_folder(Path("mine"), force=False) == Path("mine")  # a folder may have other files
+
+
+def test_a_studys_page_that_said_something_else_is_kept(tmp_path: Path) -> None:
+    from sparsestyle_ns.studies.paper_studies import _write_page
+
+    options = CompareOptions(tmp_path, (Path("a.png"),), tmp_path / "compare.html")
+    options.output_path.write_text("mine")
+    runs = SimpleNamespace(study=SimpleNamespace(name="fern"))
+    for _ in range(2):  # the second page is the first
+        assert _write_page("Comparison", options, runs, []) == options.output_path.resolve()
+    assert {path.name for path in tmp_path.iterdir()} == {"compare.html", "compare-2.html"}
+    assert (tmp_path / "compare-2.html").read_text() == "mine"
+
+
+def test_free_names_keep_suffixes_and_count_on(tmp_path: Path) -> None:
+    assert free_path(tmp_path / "a.tar.gz") == tmp_path / "a.tar.gz"
+    for name in ("a.html", "a-2.html", "folder"):
+        (tmp_path / name).touch()
+    assert free_path(tmp_path / "a.html") == tmp_path / "a-3.html"
+    assert free_path(tmp_path / "folder") == tmp_path / "folder-2"
+
+
+def test_a_painting_is_painted_over_only_where_that_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    import make_style_image
+
+    target = tmp_path / "mine.png"
+    target.write_bytes(b"mine")
+    assert make_style_image.main([str(target), "--size", "64"]) != 0
+    assert "add --force to replace it, or choose another OUTPUT" in capsys.readouterr().err
+    assert target.read_bytes() == b"mine"
+    assert make_style_image.main([str(target), "--size", "64", "--force"]) == 0
+    assert target.read_bytes() != b"mine"
+
+
+def test_inputs_are_only_read(runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path) -> None:
+    """Photos, painting and the run itself, by all commands that look at a run without being asked to write there."""
+    inputs = llff_scene, painting.parent, runs.coarse, runs.style
+    before = list(map(files_below, inputs))
+    main(["evaluate", str(runs.style), "--output-path", str(tmp_path / "report.json")])
+    main(["gallery", str(runs.style), "--output-path", str(tmp_path / "page.html"), "--frames", "2"])
+    main(["export", str(runs.style), "--format", "ply", "--output-path", str(tmp_path / "scene.ply")])
+    main(["effects", "--data", str(llff_scene), "--coarse-run", str(runs.coarse)])
+    config = ["--load-config", runs.style / "config.yml"]
+    ns_command("ns-eval", *config, "--output-path", tmp_path / "theirs.json")
+    ns_command("ns-render", "dataset", *config, "--output-path", tmp_path / "pictures")
+    flags = ["--style-image", str(painting), "--coarse-run", str(runs.coarse), "--max-num-iterations", "1"]
+    ns_train("hier-style", llff_scene, tmp_path / "outputs", *flags, *TINY_STYLE)
+    assert list(map(files_below, inputs)) == before
+
+
+def test_what_was_measured_of_an_earlier_iteration_stays(tmp_path: Path) -> None:
+    from sparsestyle_ns.studies.run_figures import FIGURES_FILE, _free_for
+
+    folder = tmp_path / "measured"
+    assert _free_for(folder, 9) == folder
+    folder.mkdir()
+    (folder / FIGURES_FILE).write_text(json.dumps({"step": 9, "figures": {}}))
+    assert _free_for(folder, 9) == folder
+    assert _free_for(folder, 19) == tmp_path / "measured-000000019"
+
+
+def test_only_checkpoints_of_its_own_are_dropped(run: Path, llff_scene: Path) -> None:
+    """Those of every save are kept by nerfstudio's own flag, here for three iterations of each."""
+    every = ["--steps-per-save", "1", "--load-dir", str(run / "nerfstudio_models")]
+    train_again(run, llff_scene, "--max-num-iterations", "5", "--save-only-latest-checkpoint", "False", *every)
+    assert steps(run) == [2, 3, 4]
+    train_again(run, llff_scene, "--max-num-iterations", "8", *every)
+    assert steps(run) == [2, 3, 4, 7]
+    assert newest_checkpoint(run / "nerfstudio_models").name == "step-000000007.ckpt"
