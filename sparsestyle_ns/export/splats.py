@@ -27,7 +27,7 @@ from sparsestyle_ns.rendering.render import Background
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_output
 
-STEPS = 250
+STEPS = 200
 """Of the fit; a tenth of a second each on a CPU, at 252 pixels."""
 BETWEEN = 6
 """In forward-facing scenes, views on the way from photo to photo that the fit sees, about."""
