@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import re
 import struct
 
 import numpy as np
@@ -12,6 +13,8 @@ from nerfstudio.cameras.cameras import Cameras
 from plyfile import PlyData
 from small_scenes import psnr, scene
 
+from sparsestyle_ns.cli import main
+from sparsestyle_ns.export import splats
 from sparsestyle_ns.export.fit_gaussians import LEAST_SIZE, fit_gaussians, least_log_scales
 from sparsestyle_ns.export.gaussians import DRAWINGS, Gaussians, picture_of_gaussians
 from sparsestyle_ns.export.gltf import ColoredMesh, encode_gltf
@@ -249,3 +252,22 @@ def test_a_mesh_as_gltf_has_linear_colours_and_needs_no_light():
     assert numbers_of(told, data, primitive["indices"])[:, 0].tolist() == [0, 1, 2]
     color = numbers_of(told, data, primitive["attributes"]["COLOR_0"])[0]
     torch.testing.assert_close(color, torch.tensor([0.0, 0.2140, 1.0]), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("form", ["splat", "glb"])
+def test_the_command_writes_splats_and_says_how_far_they_are_from_the_exact_render(
+    form, patterned_run, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(splats, "STEPS", 20)
+    path = tmp_path / "scene.file"
+    options = ["--format", form, "--output-path", str(path), "--max-splats", "1500"]
+    main(["export", str(patterned_run), *options])
+    printed = capsys.readouterr().out
+    number = int(re.search(r"([\d,]+) splats", printed)[1].replace(",", ""))
+    assert 100 < number <= 1500
+    if form == "splat":
+        assert PlyData.read(str(path))["vertex"].count == number
+    else:
+        assert parts_of(path.read_bytes())[0]["accessors"][0]["count"] == number
+    assert re.search(r"PSNR to the exact render, held-out view of \S+: [\d.]+ dB", printed)
+    assert re.search(r"Mean of the held-out views at 32 × 24, drawn as .+: [\d.]+ dB \(as ", printed)
