@@ -193,6 +193,12 @@ def contract(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     return (1.0 - 0.5 / norm) * (points / norm)
 
 
+def uncontract(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """The inverse of `contract`, at most `MAX_DISTANCE` away."""
+    norm = points.abs().amax(dim=-1, keepdim=True).clamp(min=0.5)
+    return 0.5 / (1.0 - norm).clamp(min=0.5 / MAX_DISTANCE) * (points / norm)
+
+
 def intersect_box(
     origins: Float[Tensor, "rays 3"],
     directions: Float[Tensor, "rays 3"],
@@ -222,6 +228,10 @@ class Space(nn.Module, ABC):
     @abstractmethod
     def segments(self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]) -> Segments:
         """The parts of world rays (unit directions) that lie in the scene."""
+
+    @abstractmethod
+    def to_world(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """World coordinates of field coordinates in the cube; what lies at infinity is `MAX_DISTANCE` away."""
 
 
 class ForwardFacingSpace(Space):
@@ -267,6 +277,14 @@ class ForwardFacingSpace(Space):
         extent = (last - first) * extent * scale * hit[:, None]
         return _ForwardFacingSegments(start, extent, hit, origins, directions, self.near, first, last)
 
+    def to_world(self, positions: Tensor) -> Tensor:
+        """See `Space.to_world`."""
+        size = (self.maximum - self.minimum).to(positions)
+        ndc = self.minimum.to(positions) + (0.5 * positions + 0.5) * size
+        depth = 2.0 * self.near / (1.0 - ndc[..., 2:]).clamp(min=2.0 / MAX_DISTANCE)
+        across = ndc[..., :2] * depth / ndc.new_tensor(self.focal_over_half_size)
+        return torch.cat([across, -depth], dim=-1)
+
 
 class BoxSpace(Space):
     """An axis-aligned box in the world, whose longest side is the cube's; rays start at `near`, in half sides of it."""
@@ -289,6 +307,11 @@ class BoxSpace(Space):
         beyond = (origins - center).norm(dim=-1, keepdim=True) + 0.5 * size.norm()
         return _BoxSegments(start, (far - near) * directions * scale, hit, near, far, beyond)
 
+    def to_world(self, positions: Tensor) -> Tensor:
+        """See `Space.to_world`."""
+        minimum, maximum = self.minimum.to(positions), self.maximum.to(positions)
+        return 0.5 * (minimum + maximum) + 0.5 * (maximum - minimum).amax() * positions
+
 
 class ContractedSpace(Space):
     """All of space, bent beyond `unit`, a length in the world above 0, of which rays start at `near`."""
@@ -303,3 +326,7 @@ class ContractedSpace(Space):
         """See `Space.segments`."""
         hit = torch.ones(len(origins), dtype=torch.bool, device=origins.device)
         return ContractedSegments(origins / self.unit, directions, self.near, self.unit, hit)
+
+    def to_world(self, positions: Tensor) -> Tensor:
+        """See `Space.to_world`."""
+        return self.unit * uncontract(positions)

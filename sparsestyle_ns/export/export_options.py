@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Optional
 
 import tyro
 
@@ -10,13 +10,17 @@ from sparsestyle_ns.runs.run_folder import STYLE_METHOD, find_config
 from sparsestyle_ns.utils.errors import CommandOptions, InputError
 from sparsestyle_ns.utils.files import prepare_output
 
+EXAMPLES = {"html": "scene.html", "glb": "scene.glb"}
+"""Good names of files by format, where they aren't PLY."""
+
 
 @dataclass
 class ExportOptions(CommandOptions):
     """Writes a stylised run as one file that needs no Python, and prints how close it comes to the exact render.
 
     html is a page that shows the scene in any browser with WebGL2, without server or network: drag to turn, wheel or
-    pinch to zoom. It has at most 30 MB; if it would be larger, the scene gets fewer cells. ply is a cloud of coloured
+    pinch to zoom. It has at most 30 MB; if it would be larger, the scene gets fewer cells. splat is a PLY file of 3D
+    Gaussians, for viewers and editors of splats; glb has the same, or a mesh, as glTF. ply is a cloud of coloured
     points. mesh is a PLY mesh with coloured vertices, made by Open3D's Poisson reconstruction.
     """
 
@@ -24,17 +28,27 @@ class ExportOptions(CommandOptions):
     """The run's folder or its config.yml."""
     output_path: Path
     """The file to write."""
-    format: Literal["html", "ply", "mesh"] = "html"
-    """What to write: a page, points or a mesh."""
+    format: Literal["html", "splat", "glb", "ply", "mesh"] = "html"
+    """What to write: a page, splats as PLY or as glTF, points or a mesh."""
     resolution: int = 255
     """html: cells along a side of the scene's cube. Every browser with WebGL2 can hold 255."""
     force: bool = False
     """Write over the file, if there is one of that name."""
+    mesh: bool = False
+    """glb: the mesh in place of splats."""
+    max_splats: Optional[int] = None
+    """splat and glb: how many there may be, from 1,000 on. Without it, as many as fit into 30 MB, at most 400,000."""
+    sh0: bool = False
+    """splat: leave out the coefficients of spherical harmonics that are all 0 (f_rest_*). A splat then takes 68 bytes
+    instead of 248. Some older importers miss them."""
 
     def check(self) -> None:
         """Raises an `InputError` if there is no such run, or the file can't be written."""
         if not 32 <= self.resolution <= 1023:
             raise InputError(f"--resolution {self.resolution} isn't between 32 and 1023; 255 suits most scenes.")
+        if self.mesh and self.format != "glb":
+            raise InputError("--mesh is for --format glb; for a mesh as PLY take --format mesh.")
+        if self.max_splats is not None and self.max_splats < 1000:
+            raise InputError(f"--max-splats {self.max_splats} shows no scene; give 1000 or more.")
         find_config(self.run, STYLE_METHOD)
-        example = "scene.html" if self.format == "html" else "scene.ply"
-        prepare_output(self.output_path, "The scene", example, self.force)
+        prepare_output(self.output_path, "The scene", EXAMPLES.get(self.format, "scene.ply"), self.force)

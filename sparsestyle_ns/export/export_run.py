@@ -3,6 +3,7 @@
 from sparsestyle_ns.engine.hints import after_export, finish
 from sparsestyle_ns.export.export_options import ExportOptions
 from sparsestyle_ns.export.points import export_points
+from sparsestyle_ns.export.splats import export_splats
 from sparsestyle_ns.export.stylised_scene import load_scene
 from sparsestyle_ns.export.web_page import export_page
 from sparsestyle_ns.runs.run_folder import find_config
@@ -13,13 +14,16 @@ def export_run(options: ExportOptions) -> None:
 
     Raises an `InputError` if the run has no checkpoint, its scene can't be written so, or Open3D can't be loaded.
     """
-    if options.format == "mesh":  # found out before the minutes of rendering; other formats work without Open3D
+    as_mesh = options.format == "mesh" or options.mesh
+    if as_mesh:  # found out before the minutes of rendering; other formats work without Open3D
         from sparsestyle_ns.export.mesh import export_mesh
-    scene = load_scene(find_config(options.run))
+    scene, glb = load_scene(find_config(options.run)), options.format == "glb"
     if options.format == "html":
         export_page(scene, options.output_path, options.resolution)
     elif options.format == "ply":
         export_points(scene, options.output_path)
+    elif as_mesh:
+        export_mesh(scene, options.output_path, glb)
     else:
-        export_mesh(scene, options.output_path)
+        export_splats(scene, options.output_path, options.max_splats, options.sh0, glb)
     finish(options.output_path.resolve(), after_export(options.run, options.output_path, options.format))

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from sparsestyle_ns.export.gltf import ColoredMesh, encode_gltf
 from sparsestyle_ns.export.points import Points, joined, likeness, print_likeness, surfaces
 from sparsestyle_ns.export.stylised_scene import StylisedScene
 from sparsestyle_ns.utils.errors import InputError
@@ -37,12 +38,14 @@ FAR = 4.0
 reconstruction closes holes with them."""
 
 
-def export_mesh(scene: StylisedScene, output_path: Path) -> None:
-    """Writes a mesh with coloured vertices as PLY, and prints how well it shows each training view."""
+def export_mesh(scene: StylisedScene, output_path: Path, glb: bool = False) -> None:
+    """Writes a mesh with coloured vertices as PLY, or as glTF, and prints how well it shows each training view."""
     pictures, parts = surfaces(scene)
     mesh = poisson_mesh(joined(parts))
-    write_output(output_path, encode_mesh(mesh), "The mesh", "scene.ply")
-    print(f"{len(mesh.vertices):,} vertices, {len(mesh.triangles):,} triangles, in nerfstudio's coordinates")
+    content = encode_gltf(colored_mesh(mesh), scene.model.space) if glb else encode_mesh(mesh)
+    write_output(output_path, content, "The mesh", "scene.glb" if glb else "scene.ply")
+    frame = "glTF's coordinates, y up" if glb else "nerfstudio's coordinates"
+    print(f"{len(mesh.vertices):,} vertices, {len(mesh.triangles):,} triangles, in {frame}")
     print("The mesh without light against the exact render:")
     shown = [picture_of_mesh(mesh, scene.cameras[index : index + 1]) for index in range(len(pictures))]
     print_likeness(scene.names, [likeness(*seen, picture) for seen, picture in zip(shown, pictures, strict=True)])
@@ -73,6 +76,13 @@ def encode_mesh(mesh: open3d.geometry.TriangleMesh) -> bytes:
         path = Path(folder) / "mesh.ply"
         open3d.io.write_triangle_mesh(str(path), mesh)
         return path.read_bytes()
+
+
+def colored_mesh(mesh: open3d.geometry.TriangleMesh) -> ColoredMesh:
+    """The same mesh in numpy's arrays."""
+    mesh.compute_vertex_normals()
+    parts = (mesh.vertices, mesh.vertex_normals, mesh.vertex_colors, mesh.triangles)
+    return ColoredMesh(*map(np.asarray, parts))
 
 
 def picture_of_mesh(

@@ -81,6 +81,14 @@ class TrainingPixels:
         return slice(self.starts[view], self.starts[view + 1])
 
 
+@dataclass
+class PixelSampler:
+    """By which `ns-export pointcloud` and `poisson` ask for random pixels, each time others: how many at once."""
+
+    num_rays_per_batch: Optional[int] = None
+    """None: nobody asked, and batches are those of training."""
+
+
 class FewShotDataManager(VanillaDataManager[PhotoDataset]):
     """Chooses the views to train on (`select_views`), reduces large photos, and keeps all their rays in memory.
 
@@ -105,6 +113,7 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         # In place of VanillaDataManager's, which reads the scene unchecked.
         self.config, self.device, self.test_mode = config, device, test_mode
         self.world_size, self.local_rank = world_size, local_rank
+        self.train_pixel_sampler = PixelSampler()
         side, rays = config.max_image_side, config.train_num_rays_per_batch
         if side is not None and side < SMALLEST_SIDE:
             raise InputError(f"--max-image-side is {side}; give {SMALLEST_SIDE} pixels or more.")
@@ -284,10 +293,12 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         bundle's metadata as `matched_distance`, which is 0 for the others.
         """
         self.train_count += 1
-        generator = torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + step)
-        count = self.config.train_num_rays_per_batch
+        asked = self.train_pixel_sampler.num_rays_per_batch
+        seed = step if asked is None else self.train_count  # nerfstudio's exporters ask for step 0 again and again
+        generator = torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + seed)
+        count = asked or self.config.train_num_rays_per_batch
         pick = torch.randint(len(self.pixels.trusted), (count,), generator=generator, device=self.device)
-        pixels, matched, metadata = self.pixels, self.matched, {}
+        pixels, matched, metadata = self.pixels, self.matched if asked is None else None, {}
         chosen = pixels.trusted[pick]
         rays = pixels.origins[chosen], pixels.directions[chosen], pixels.views[chosen]
         if matched is not None:

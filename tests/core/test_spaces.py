@@ -74,6 +74,16 @@ def scene(request):
     return request.param()
 
 
+def test_the_way_to_the_world_is_back_along_the_ray(scene):
+    space, origins, directions, _ = scene
+    segments = space.segments(origins, directions)
+    s = torch.linspace(0.02, 0.9, 7).expand(RAYS, 7)
+    distances = torch.cat([segments.distance(column[:, None]) for column in s.T], dim=-1)
+    expected = origins[:, None] + distances[..., None] * directions[:, None]
+    found = space.to_world(segments.positions(s))
+    torch.testing.assert_close(found[segments.hit], expected[segments.hit], rtol=1e-3, atol=1e-3)
+
+
 def test_a_segment_stays_in_the_cube(scene):
     space, origins, directions, _ = scene
     segments = space.segments(origins, directions)

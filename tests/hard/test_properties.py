@@ -242,11 +242,14 @@ def test_points_of_a_ray_have_their_images_on_the_rays_image(data, count, near, 
     assert ((images - start - t * extent).abs() <= 1e-3 * size)[plain.squeeze(-1)].all()
 
 
-@covers(space.spacing, space.inverse_spacing, space.contract)
+@covers(space.spacing, space.inverse_spacing, space.contract, space.uncontract)
 @given(st.data(), COUNTS, FLOATS)
 def test_contraction_and_spacing_stay_in_their_ranges(data, count, dtype):
     points = data.draw(tensors((count, 3), -37, 38, signed=True, dtype=dtype)).requires_grad_()
     bent = space.contract(points)
+    shown = points.abs().amax(dim=-1) < 0.01 * space.MAX_DISTANCE  # farther away digits are lost
+    torch.testing.assert_close(space.uncontract(bent)[shown], points[shown], rtol=1e-3, atol=1e-6)
+    assert space.uncontract(bent).abs().max() <= space.MAX_DISTANCE * (1 + 1e-6)
     (gradient,) = torch.autograd.grad(bent.sum(), points)
     assert bent.abs().max() <= 1 and gradient.isfinite().all()
     distances = points.detach().abs().flatten()
