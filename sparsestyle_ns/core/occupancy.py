@@ -166,6 +166,6 @@ def march(segments: Segments, occupancy: Optional[Occupancy], num_steps: int, un
         if unbounded:
             filled[:, -1] = True
         keep = keep & filled
-    ray_indices, step = keep.nonzero(as_tuple=True)
+    kept = keep.nonzero(as_tuple=True)
     lengths = interval_lengths(segments, edges, unbounded)
-    return PackedSamples(ray_indices, middle[keep], lengths[ray_indices, step], positions[keep])
+    return PackedSamples(kept[0], middle[kept], lengths[kept], positions[kept])

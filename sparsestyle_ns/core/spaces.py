@@ -142,7 +142,7 @@ class ContractedSegments(Segments):
         return inverse_spacing(start + s * (end - start))
 
     def _ends(self, like: Tensor) -> Tuple[Tensor, Tensor]:
-        return self.ends or (spacing(like.new_tensor(self.near)), spacing(like.new_tensor(MAX_DISTANCE)))
+        return self.ends or (spacing(like.new_full((), self.near)), spacing(like.new_full((), MAX_DISTANCE)))
 
     def _part(self, start: Tensor, end: Tensor, hit: Tensor) -> "ContractedSegments":
         first, last = self._ends(start)

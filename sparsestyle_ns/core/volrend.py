@@ -64,6 +64,18 @@ class _DenseWeights(torch.autograd.Function):
         return behind * grad - F.pad(hidden, (0, 1))
 
 
+def ray_borders(ray_indices: Int[Tensor, "samples"], num_rays: int) -> Int[Tensor, "rays_plus_1"]:
+    """The place of each ray's first sample, and last the number of all; a ray without samples begins where it ends.
+
+    Example:
+        >>> ray_borders(torch.tensor([0, 0, 2]), num_rays=3)
+        tensor([0, 2, 2, 3])
+    """
+    # Counting by `bincount` would make a GPU look at its input first, and the CPU wait for that.
+    rays = torch.arange(num_rays + 1, device=ray_indices.device)
+    return torch.searchsorted(ray_indices.contiguous(), rays)
+
+
 def packed_transmittance(
     depth: Float[Tensor, "samples"], ray_indices: Int[Tensor, "samples"], num_rays: int
 ) -> Float[Tensor, "samples"]:
@@ -71,8 +83,7 @@ def packed_transmittance(
     depth = at_least_float32(depth)
     # In float64, with τ capped, the error of a difference of two sums over all rays stays below 1e-6.
     before = F.pad(torch.cumsum(depth.double(), dim=0), (1, 0))
-    counts = torch.bincount(ray_indices, minlength=num_rays)
-    in_front = before[:-1] - before[torch.cumsum(counts, dim=0) - counts][ray_indices]
+    in_front = before[:-1] - before[ray_borders(ray_indices, num_rays)[:-1]][ray_indices]
     return torch.exp(-in_front).to(depth.dtype)
 
 
@@ -99,8 +110,7 @@ class _PackedWeights(torch.autograd.Function):
     def backward(ctx, grad: Tensor) -> Tuple[Tensor, None, None]:
         behind, weights, ray_indices = ctx.saved_tensors
         up_to = F.pad(torch.cumsum((weights * grad).double(), dim=0), (1, 0))
-        ends = torch.cumsum(torch.bincount(ray_indices, minlength=ctx.num_rays), dim=0)
-        hidden = up_to[ends][ray_indices] - up_to[1:]
+        hidden = up_to[ray_borders(ray_indices, ctx.num_rays)[1:]][ray_indices] - up_to[1:]
         return behind * grad - hidden.to(grad.dtype), None, None
 
 

@@ -27,6 +27,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sparsestyle_ns.core.ndc import ndc_rays
+from sparsestyle_ns.data.estimated import estimated_distortion
 from sparsestyle_ns.data.parser_choice import advice
 from sparsestyle_ns.data.photos import check_one_size, images_in, open_photo, photo_size
 from sparsestyle_ns.data.scene_info import NDC, SCENE_INFO, SceneInfo
@@ -99,9 +100,12 @@ class LLFFDataParser(DataParser):
         view_ids = self._view_ids(split, len(filenames))
         poses, fx = camera_to_worlds[view_ids].float(), focals[view_ids, None].float()
         num_views = len(view_ids) if len(view_ids) <= interval else USUAL_NUM_VIEWS
+        lenses = estimated_distortion(folder, [filenames[i].name for i in view_ids])
         return DataparserOutputs(
             image_filenames=[filenames[i] for i in view_ids],
-            cameras=Cameras(poses, fx, fx, cx=width / 2, cy=height / 2, width=width, height=height),
+            cameras=Cameras(
+                poses, fx, fx, cx=width / 2, cy=height / 2, width=width, height=height, distortion_params=lenses
+            ),
             scene_box=_ndc_scene_box(camera_to_worlds, focals, (width, height), ndc.focal_over_half_size, filenames),
             dataparser_scale=scale,
             dataparser_transform=transform.float(),

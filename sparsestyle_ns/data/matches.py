@@ -1,23 +1,24 @@
 """The same surface points in different photos, found by matching and checked against the cameras.
 
+Where a scene keeps the tracks that its cameras were estimated from, the points are those.
+
 A match of two features counts where it obeys the epipolar geometry of the two known cameras within a pixel. Colours are
 those of blurred photos, so that a match that is off by a fraction of a pixel doesn't count as a difference.
 """
 
 from dataclasses import dataclass
-from typing import List, Optional, Sequence, Tuple
+from typing import List, Optional, Sequence
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from nerfstudio.cameras.camera_utils import radial_and_tangential_undistort
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from sparsestyle_ns.data.features import find_features, linked_groups, mutual_matches
+from sparsestyle_ns.data.features import Pair, find_features, linked_groups, match_photos
+from sparsestyle_ns.data.tracks import Tracks
 
-MAX_FEATURES, MIN_CONTRAST, MAX_RATIO = 2000, 0.02, 0.8
-"""Of the matcher (`features`); lenient, as the known cameras sort out wrong matches."""
 MAX_EPIPOLAR_ERROR = 1.0
 """Sampson distance, in pixels, up to which a match obeys the cameras."""
 BLUR = 2.0
@@ -70,27 +71,41 @@ class PixelRays:
 class _View:
     """A photo's features; `directions` are unit vectors in the world, `pixel` a pixel's side over the focal length."""
 
-    descriptors: Float[np.ndarray, "features 128"]
     rays: PixelRays
     directions: Float[np.ndarray, "features 3"]
     rgba: Float[np.ndarray, "features 4"]
     pixel: float
 
 
-def match_points(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras) -> PointMatches:
+def match_points(
+    photos: Sequence[Float[np.ndarray, "H W 4"]],
+    cameras: Cameras,
+    names: Sequence[str] = (),
+    tracks: Optional[Tracks] = None,
+) -> PointMatches:
     """Points that two RGBA photos in [0, 1] see; only where both are opaque, and by cameras that are `LENSES`.
 
-    Cameras are one for each photo, for images of any size with the same aspect.
+    Args:
+        cameras: one for each photo, for images of any size with the same aspect.
+        names: the photos' file names, by which `tracks` knows them.
+        tracks: what is seen where, if that is known; else features are matched.
     """
     poses = cameras.camera_to_worlds.double().numpy()
-    seen = [_look_at(photo, cameras, index) for index, photo in enumerate(photos)]
+    pairs = _neighbouring_pairs(poses)
+    if tracks is None:
+        found = match_photos([find_features(_grey(photo)) for photo in photos], pairs)
+    else:
+        found = tracks.matches(names, [photo.shape[1::-1] for photo in photos])
+    seen = [
+        _look_at(photo, points, cameras, index)
+        for index, (photo, points) in enumerate(zip(photos, found.points, strict=True))
+    ]
     views, colors, directions = [np.zeros((2, 0), int)], [np.zeros((2, 0, 3))], [np.zeros((2, 0, 3))]
-    for pair in _neighbouring_pairs(poses):
+    for pair in pairs:
         both = [seen[index] for index in pair]
         if None in both:
             continue
-        rows = mutual_matches(*(view.descriptors for view in both), MAX_RATIO)
-        matched = list(zip(both, rows, strict=True))
+        matched = list(zip(both, found.pairs[pair], strict=True))
         rgba = np.stack([view.rgba[row] for view, row in matched])
         error = epipolar_error(*(view.rays[row] for view, row in matched), *poses[list(pair)])
         good = (error < MAX_EPIPOLAR_ERROR * max(view.pixel for view in both)) & (rgba[..., 3] > 0.99).all(axis=0)
@@ -101,21 +116,25 @@ def match_points(photos: Sequence[Float[np.ndarray, "H W 4"]], cameras: Cameras)
     return PointMatches(*joined, num_views=len(photos))
 
 
-def _look_at(photo: Float[np.ndarray, "H W 4"], cameras: Cameras, index: int) -> Optional[_View]:
+def _grey(photo: Float[np.ndarray, "H W 4"]) -> UInt8[np.ndarray, "H W"]:
+    return (255.0 * (photo[..., :3] * photo[..., 3:]).mean(axis=-1)).astype(np.uint8)
+
+
+def _look_at(
+    photo: Float[np.ndarray, "H W 4"], points: Float[np.ndarray, "features 2"], cameras: Cameras, index: int
+) -> Optional[_View]:
     kind = CameraType(int(cameras.camera_type[index]))
     if kind not in LENSES:
         return None
-    grey = (255.0 * (photo[..., :3] * photo[..., 3:]).mean(axis=-1)).astype(np.uint8)
-    features = find_features(grey, MAX_FEATURES, MIN_CONTRAST)
     pixels = float(cameras.width[index]) / photo.shape[1]
     center = np.array([float(cameras.cx[index]), float(cameras.cy[index])])
     focal = np.array([float(cameras.fx[index]), float(cameras.fy[index])])
-    at = ((0.5 + features.points) * pixels - center) / focal
+    at = ((0.5 + points) * pixels - center) / focal
     rays = rays_of(undistorted(at, cameras, index), kind)
     directions = rays.directions @ cameras.camera_to_worlds[index, :, :3].double().numpy().T
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    rgba = sample(cv2.GaussianBlur(photo, (0, 0), BLUR), features.points)
-    return _View(features.descriptors, rays, directions, rgba, pixels / focal.mean())
+    rgba = sample(cv2.GaussianBlur(photo, (0, 0), BLUR), points)
+    return _View(rays, directions, rgba, pixels / focal.mean())
 
 
 def distances_along(
@@ -134,7 +153,7 @@ def distances_along(
     return np.where(parallel, np.inf, along / np.where(parallel, 1.0, square_of_sine))
 
 
-def _neighbouring_pairs(poses: Float[np.ndarray, "views 3 4"]) -> List[Tuple[int, int]]:
+def _neighbouring_pairs(poses: Float[np.ndarray, "views 3 4"]) -> List[Pair]:
     agreement = poses[:, :, 2] @ poses[:, :, 2].T
     near = np.argsort(-agreement, axis=1)[:, : NEAREST_VIEWS + 1]
     pairs = ((view, other) for view, others in enumerate(near.tolist()) for other in others if other != view)

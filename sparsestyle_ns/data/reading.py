@@ -14,9 +14,11 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from sparsestyle_ns.data.colmap import read_colmap
+from sparsestyle_ns.data.estimated import estimated_cameras
 from sparsestyle_ns.data.parser_choice import advice
 from sparsestyle_ns.data.photos import has_opacity, open_photo
 from sparsestyle_ns.data.scene_info import SCENE_INFO, SceneInfo
+from sparsestyle_ns.data.tracks import Tracks
 from sparsestyle_ns.data.view_selection import BLENDER_VIEWS
 from sparsestyle_ns.utils.errors import InputError
 
@@ -59,10 +61,12 @@ def read_scene(parser: DataParser, split: str = "train") -> DataparserOutputs:
     _check_cameras(outputs)
     if outputs.alpha_color is None and any(map(has_opacity, outputs.image_filenames)):
         outputs = replace(outputs, alpha_color=torch.ones(3))  # else the colours that nobody sees would be trained on
-    if SCENE_INFO in outputs.metadata:
-        return outputs
     standard_views = BLENDER_VIEWS if isinstance(config, BlenderDataParserConfig) else None
-    info = SceneInfo(tuple(range(len(outputs.image_filenames))), standard_views=standard_views)
+    usual = SceneInfo(tuple(range(len(outputs.image_filenames))), standard_views=standard_views)
+    info = outputs.metadata.get(SCENE_INFO, usual)
+    folder = config.data if config.data.is_dir() else config.data.parent
+    if estimated_cameras(folder) is not None:
+        info = replace(info, poses_estimated=True, tracks=Tracks.find(folder))
     return replace(outputs, metadata={**outputs.metadata, SCENE_INFO: info})
 
 

@@ -10,6 +10,8 @@ from typing import Optional, Tuple
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
+from sparsestyle_ns.data.tracks import Tracks
+
 SCENE_INFO = "scene_info"
 """Where a dataparser's metadata has the `SceneInfo`."""
 
@@ -38,12 +40,16 @@ class SceneInfo:
         ndc: None where the bounds of depth aren't known.
         standard_views: ids of the few views that papers train on, in their order; None: views at even steps.
         default_num_views: how many views to train on unless `--num-views` says otherwise.
+        poses_estimated: whether the cameras were estimated from these few photos, and so are not quite right.
+        tracks: what the photos show where, if the cameras were estimated from that.
     """
 
     view_ids: Tuple[int, ...]
     ndc: Optional[NDC] = None
     standard_views: Optional[Tuple[int, ...]] = None
     default_num_views: int = 8
+    poses_estimated: bool = False
+    tracks: Optional[Tracks] = None
 
 
 def scene_info(outputs: DataparserOutputs) -> SceneInfo:

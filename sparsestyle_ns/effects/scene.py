@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sparsestyle_ns.data.matches import PointMatches, match_points
 from sparsestyle_ns.data.photos import open_photo
-from sparsestyle_ns.data.scene_info import NDC, scene_info
+from sparsestyle_ns.data.scene_info import NDC, SCENE_INFO, scene_info
 from sparsestyle_ns.data.view_selection import evenly_spaced
 
 LONGEST_SIDE = 504
@@ -75,7 +75,10 @@ class Scene:
     def matches(self) -> PointMatches:
         """Points that are seen in two of `matched_views`; photos are numbered by their places there."""
         chosen = self.matched_views
-        return match_points([self.photos[index] for index in chosen], self.cameras[torch.tensor(chosen)])
+        names = [self.outputs.image_filenames[index].name for index in chosen]
+        cameras, info = self.cameras[torch.tensor(chosen)], self.outputs.metadata.get(SCENE_INFO)
+        tracks = None if info is None else info.tracks
+        return match_points([self.photos[index] for index in chosen], cameras, names, tracks)
 
     @property
     def matched_views(self) -> List[int]:

@@ -18,7 +18,7 @@ from sparsestyle_ns.engine.schedules import over_iterations
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleTask
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
+from sparsestyle_ns.utils.skip_nonfinite import FiniteMuon, FiniteOptimizers
 
 
 @dataclass
@@ -35,7 +35,7 @@ class FusedAdamConfig(AdamOptimizerConfig):
 class MuonConfig(OptimizerConfig):
     """Muon (Jordan 2024), for the matrices of hidden layers: each step is the gradient's nearest orthogonal matrix."""
 
-    _target: Type = torch.optim.Muon
+    _target: Type = FiniteMuon
     lr: float = 0.02
     eps: float = 1e-7
     momentum: float = 0.95

@@ -18,10 +18,11 @@ from torch.nn import functional as F
 
 from sparsestyle_ns.core.occupancy import Occupancy, march
 from sparsestyle_ns.core.spaces import ForwardFacingSpace, Segments, Space
-from sparsestyle_ns.models.hier_style import RAYS_PER_CALL, HierStyleModel
+from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT, SIDE, BakedVolume, decode, encode, render_baked
 from sparsestyle_ns.rendering.mixing import Appearance, Mix, mixed
 from sparsestyle_ns.rendering.render import render_packed
+from sparsestyle_ns.utils.device_sizes import sizes_for
 from sparsestyle_ns.utils.progress import track
 
 EMPTY = 1
@@ -65,8 +66,9 @@ class VoxelGrid:
 def ray_segments(camera: Cameras, space: Space) -> Iterator[Segments]:
     """The segments of one camera's rays, row by row, some thousands at a time."""
     bundle = camera.generate_rays(camera_indices=0, keep_shape=False).flatten()
-    for start in range(0, len(bundle), RAYS_PER_CALL):
-        part = bundle[start : start + RAYS_PER_CALL]
+    at_once = sizes_for(bundle.origins.device).marched_rays
+    for start in range(0, len(bundle), at_once):
+        part = bundle[start : start + at_once]
         yield space.segments(part.origins, part.directions)
 
 

@@ -14,9 +14,7 @@ from torch import Tensor, nn
 
 from sparsestyle_ns.core.precision import at_least_float32
 from sparsestyle_ns.field_components.thinned_mlp import Thinning, thin
-
-BLOCK = {"cpu": 1 << 12, "cuda": 1 << 17}
-"""Points at once, by device."""
+from sparsestyle_ns.utils.device_sizes import sizes_for
 
 
 def blocked_mlp(
@@ -64,7 +62,9 @@ class _BlockedMLP(torch.autograd.Function):
         found = [torch.zeros_like(part, dtype=exact) for part in parameters]
         first: List[Tensor] = []
         with torch.autocast(gradients.device.type, enabled=False):
-            for block, gradient in zip(_blocks(inputs), gradients.split(_block_size(gradients)), strict=True):
+            for block, gradient in zip(
+                _blocks(inputs), gradients.split(sizes_for(gradients.device).mlp_points), strict=True
+            ):
                 hidden, gradient = layers.hidden(block), gradient.to(ctx.dtype)
                 for number in reversed(range(len(hidden))):
                     found[2 * number + 3] += gradient.sum(dim=0, dtype=exact)
@@ -107,9 +107,5 @@ class _Layers:
         return F.linear(hidden, self.weights[-1], self.biases[-1])
 
 
-def _block_size(tensor: Tensor) -> int:
-    return BLOCK["cpu" if tensor.device.type == "cpu" else "cuda"]
-
-
 def _blocks(inputs: Sequence[Tensor]) -> List[Tuple[Tensor, ...]]:
-    return list(zip(*(each.split(_block_size(each)) for each in inputs), strict=True))
+    return list(zip(*(each.split(sizes_for(each.device).mlp_points) for each in inputs), strict=True))

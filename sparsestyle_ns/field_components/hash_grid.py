@@ -15,6 +15,7 @@ from nerfstudio.field_components.encodings import FieldComponent
 from torch import Tensor, nn
 
 from sparsestyle_ns.field_components import hash_grid_kernels
+from sparsestyle_ns.utils.machine import numbers_on
 
 HASH_PRIMES = (1, 2654435761, 805459861)
 """π1, π2, π3 of the spatial hash (instant-ngp, Eq. 4)."""
@@ -65,11 +66,11 @@ def locate_corners(positions: Float[Tensor, "points 3"], resolutions: Tuple[int,
 
     Level m's rows start at m · T of the joined table.
     """
-    scale = torch.tensor(resolutions, device=positions.device, dtype=positions.dtype)
+    scale = numbers_on(resolutions, positions.device, positions.dtype)
     scaled = positions[:, None] * scale[:, None]
     lower = scaled.floor()
     fraction = scaled - lower
-    offsets = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], device=positions.device)
+    offsets = numbers_on([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], positions.device)
     corners = lower.long()[:, :, None] + offsets
     near = torch.where(offsets.bool(), fraction[:, :, None], 1.0 - fraction[:, :, None])
     level_start = torch.arange(len(resolutions), device=positions.device)[:, None] * table_size

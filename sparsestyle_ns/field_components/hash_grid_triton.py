@@ -5,11 +5,12 @@ Gradients of rows that several points share are added up atomically, in no fixed
 
 from typing import Tuple
 
-import torch
 import triton
 import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
+
+from sparsestyle_ns.utils.machine import numbers_on
 
 POINTS_PER_PROGRAM = 128
 
@@ -57,7 +58,7 @@ def _gather(
     valid = inside[:, None] & (feature < features)[None, :]
     x, y, z, fx, fy, fz = _cell(positions, tl.load(resolutions + level), points, inside)
     first = table + level.to(tl.int64) * table_size * features
-    total = tl.zeros((block, padded), dtype=encoded.dtype.element_ty)
+    total = tl.full((block, padded), 0.0, dtype=encoded.dtype.element_ty)
     for corner in tl.static_range(8):
         row, weight = _corner(x, y, z, fx, fy, fz, corner, table_size)
         values = tl.load(first + row[:, None] * features + feature[None, :], mask=valid, other=0.0)
@@ -113,15 +114,19 @@ def scatter(
     return table_grad
 
 
+def _programs(num_points: int, levels: int) -> Tuple[int, int]:
+    """How many programs there are: blocks of points first, as CUDA allows 2³¹ − 1 there and 65,535 beside."""
+    return triton.cdiv(num_points, POINTS_PER_PROGRAM), levels
+
+
 def _launch(kernel, table, positions, resolutions, values, table_shape: Tuple[int, int, int]) -> None:
     levels, rows, features = table_shape
     if len(positions) == 0:
         return
-    grid = (triton.cdiv(len(positions), POINTS_PER_PROGRAM), levels)
-    kernel[grid](
+    kernel[_programs(len(positions), levels)](
         table,
         positions.contiguous(),
-        torch.tensor(resolutions, dtype=positions.dtype, device=positions.device),
+        numbers_on(resolutions, positions.device, positions.dtype),
         values,
         len(positions),
         levels=levels,

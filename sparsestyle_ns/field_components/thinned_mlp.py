@@ -43,6 +43,7 @@ def thin(
     # Gradients that are all 0, or not numbers, stay as they are.
     chance = torch.where(sizes < limit, sizes / limit, 1.0)
     drawn = torch.rand(len(sizes), device=sizes.device, dtype=sizes.dtype, generator=thinning.generator)
+    # The one place of a backward pass that waits for a GPU: how many points are left is the size of all that follows.
     (kept,) = (drawn < chance).nonzero(as_tuple=True)
     gradients = gradients[kept] / chance[kept, None]
     missing = -len(kept) % MULTIPLE if len(kept) > MULTIPLE else 0

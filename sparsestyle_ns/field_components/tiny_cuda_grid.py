@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from sparsestyle_ns.field_components.hash_grid import Corners, GridLocation, hash_corners, interpolate
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.machine import numbers_on
 
 POSSIBLE_FEATURES = (1, 2, 4, 8)
 """Of a row, in the library."""
@@ -68,7 +69,7 @@ def tiny_cuda_levels(
 
 def locate_tiny_cuda_corners(positions: Float[Tensor, "points 3"], levels: Tuple[Level, ...]) -> Corners:
     """Table rows and trilinear weights of points in [0, 1]³; corners beyond a level's last begin again at its first."""
-    offsets = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], device=positions.device)
+    offsets = numbers_on([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], positions.device)
     rows, weights = [], []
     for level in levels:
         scaled = positions * level.scale + 0.5

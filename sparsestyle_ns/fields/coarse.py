@@ -15,11 +15,9 @@ from torch import Tensor, nn
 
 from sparsestyle_ns.field_components.positional_encoding import PositionalEncoding
 from sparsestyle_ns.field_components.thinned_mlp import Thinning, thinned_mlp
+from sparsestyle_ns.utils.device_sizes import sizes_for
 
 DensityActivation = Literal["softplus", "exp"]
-POINTS_PER_CHUNK = {"cpu": 1 << 12, "cuda": 1 << 17}
-"""By device: on a CPU, hidden layers of so many points stay in the cache, which makes a frozen coarse field 1.5 times
-as fast as 2^17 at once (2.8 against 4.2 µs a point on two cores); on a GPU it is memory alone that sets a bound."""
 MAX_LOG_DENSITY = 15.0
 """ln of the largest density, 3e6 per half side of the cube: opaque within a thousandth of a hash cell, and far from
 float32's largest number, which products with intervals and sums must not reach."""
@@ -31,7 +29,7 @@ def in_chunks(function: Callable[..., Tuple[Tensor, ...]], *inputs: Tensor) -> T
     With gradients all points are evaluated at once: their hidden layers are kept for the backward pass anyhow. Inputs
     and outputs have a row for each point.
     """
-    size = POINTS_PER_CHUNK["cpu" if inputs[0].device.type == "cpu" else "cuda"]
+    size = sizes_for(inputs[0].device).mlp_points
     if torch.is_grad_enabled() or len(inputs[0]) <= size:
         return function(*inputs)
     pieces = [function(*piece) for piece in zip(*(each.split(size) for each in inputs), strict=True)]

@@ -34,7 +34,7 @@ class FineTunedField(nn.Module):
     ) -> Tuple[Float[Tensor, "points"], Float[Tensor, "points 3"]]:
         """σ and c in [0, 1] at located points; what the frozen field has there isn't looked at."""
         density, own_feature = self.field.density_and_feature(location.positions)
-        ahead = torch.tensor([0.0, 0.0, -1.0], device=location.positions.device)
+        ahead = -torch.eye(3, device=location.positions.device)[2]
         return density, self.field.color(own_feature, ahead.expand_as(location.positions)).float()
 
 

@@ -39,7 +39,8 @@ class _SlicedLoss(StylizationLoss):
     def distance(self, points: Float[Tensor, "points D"], step: int) -> Float[Tensor, ""]:
         generator = torch.Generator().manual_seed(step)
         points = _drawn(at_least_float32(points), generator)
-        directions = random_directions(points.shape[-1], self.num_directions, generator).to(points)
+        # Drawn on the CPU, the same are drawn for every device; nothing waits for a copy that is on its way.
+        directions = random_directions(points.shape[-1], self.num_directions, generator).to(points, non_blocking=True)
         return sliced_distance(points, self.points.to(points), directions) / self.spread.to(points)
 
 
@@ -76,4 +77,4 @@ def _drawn(points: Float[Tensor, "points D"], generator: torch.Generator) -> Flo
     if len(points) <= MOST_COMPARED:
         return points
     places = torch.randint(len(points), (MOST_COMPARED,), generator=generator)
-    return points[places.to(points.device)]
+    return points[places.to(points.device, non_blocking=True)]

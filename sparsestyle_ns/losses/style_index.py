@@ -8,15 +8,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestyle_ns.core.precision import at_least_float32, without_autocast
+from sparsestyle_ns.utils.device_sizes import sizes_for
 
 SHORTEST = 1e-12
 """Vectors no longer than this have no direction."""
 COARSE, FINE = 23, 127
 """Principal directions in which similarities are bounded, first of all pairs and then of those that are left."""
-BLOCK_SIZES = {"cpu": 128, "cuda": 1024}
-"""Most style vectors in a block; a GPU wants fewer and larger products."""
-BOUNDED_AT_ONCE = {"cpu": 1024, "cuda": 4096}
-"""Vectors of either kind whose similarities are bounded at once; on a CPU the bounds should stay in its cache."""
 TABLE_SIZE, BASIS_SAMPLE = 1 << 23, 4096
 """Bounds kept at once, one a feature vector and block, and style vectors that give the principal directions."""
 
@@ -53,7 +50,7 @@ class StyleIndex:
         axes = _principal_axes(directions)
         self.bases = [axes[:, :count].contiguous() for count in (COARSE, FINE)]
         coarse, fine = (_outline(directions, basis) for basis in self.bases)
-        self.rows = distinct[_similar_blocks(coarse[distinct], block_size or BLOCK_SIZES.get(device.type, 1024))]
+        self.rows = distinct[_similar_blocks(coarse[distinct], block_size or sizes_for(device).style_block)]
         self.blocks, self.coarse, self.fine = directions[self.rows], coarse[self.rows], fine[self.rows]
         places = torch.empty_like(first)
         places[self.rows.flatten()] = torch.arange(self.rows.numel(), device=device)
@@ -91,19 +88,21 @@ class StyleIndex:
         finer_bounds, _ = _block_maxima(fine, self.fine, blocks, rows)
         best_bounds = finer_bounds.new_full((len(directions),), -torch.inf)
         is_favorite = finer_bounds == best_bounds.scatter_reduce_(0, rows, finer_bounds, "amax")[rows]
-        compare(blocks[is_favorite], rows[is_favorite])
-        is_left = ~is_favorite & (finer_bounds >= best[rows])
-        compare(blocks[is_left], rows[is_left])
+        # A GPU is waited for wherever the number of pairs that are left must be known, seven times in a search.
+        # Comparing all with all would wait for nothing, but do ten times the work.
+        pairs = is_favorite.nonzero().squeeze(-1)
+        compare(blocks[pairs], rows[pairs])
+        pairs = (~is_favorite & (finer_bounds >= best[rows])).nonzero().squeeze(-1)
+        compare(blocks[pairs], rows[pairs])
 
         rows, values, found = (torch.cat(parts) for parts in zip(*compared, strict=True))
-        is_best = values == best[rows]
-        nearest = rows.new_zeros(len(best))
-        return nearest.scatter_reduce_(0, rows[is_best], found[is_best], "amin", include_self=False)
+        found = torch.where(values == best[rows], found, len(self._places) - 1)
+        return rows.new_zeros(len(best)).scatter_reduce_(0, rows, found, "amin", include_self=False)
 
     def _bounds(self, outlines: Float[Tensor, "n k"]) -> Float[Tensor, "blocks n"]:
         """Bounds of the similarities between each feature vector and any style vector of each block."""
         num_blocks, block_size, _ = self.coarse.shape
-        side = BOUNDED_AT_ONCE.get(outlines.device.type, 4096)
+        side = sizes_for(outlines.device).bounded_vectors
         blocks_at_once = max(1, side // block_size)
         bounds = outlines.new_empty(num_blocks, len(outlines))
         # Memory that is new for each product would cost as much time as the product.
@@ -181,7 +180,8 @@ def _block_maxima(
     rows: Int[Tensor, " P"],
 ) -> Tuple[Float[Tensor, " P"], Int[Tensor, " P"]]:
     """The largest product of a vector with those of a block, and its first place there, for pairs sorted by block."""
-    counts = torch.bincount(blocks, minlength=len(style_blocks)).tolist()
+    ends = torch.searchsorted(blocks, torch.arange(len(style_blocks), device=blocks.device), right=True)
+    counts = torch.diff(ends, prepend=ends.new_zeros(1)).tolist()
     maxima = [
         (vectors[members] @ block.T).max(dim=1) for block, members in zip(style_blocks, rows.split(counts), strict=True)
     ]

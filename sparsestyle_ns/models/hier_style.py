@@ -24,14 +24,13 @@ from sparsestyle_ns.rendering.look import Display, Look, RenderMode
 from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.rendering.render import FrozenSamples, PackedRender, surface_distance
 from sparsestyle_ns.rendering.visible_samples import Marching
+from sparsestyle_ns.utils.device_sizes import sizes_for
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.numba_kernels import untraced
 from sparsestyle_ns.utils.progress import bar
 
 BAKED_RAYS = 1 << 16
 """Rays of a baked picture that are marched at once; a viewer can break it off in between."""
-RAYS_PER_CALL = 1 << 13
-"""Rays that are marched at once; bounds the memory of the steps in empty space."""
 
 
 @dataclass
@@ -158,7 +157,8 @@ class HierStyleModel(SceneModel):
         self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], marching: Optional[Marching] = None
     ) -> FrozenSamples:
         """`freeze_samples` of rays for this model's own style, by default those on which it learns."""
-        parts = zip(origins.split(RAYS_PER_CALL), directions.split(RAYS_PER_CALL), strict=True)
+        most = sizes_for(self.device).marched_rays
+        parts = zip(origins.split(most), directions.split(most), strict=True)
         return self._freeze((self.space.segments(*part) for part in parts), marching or self.learning)
 
     def _freeze(self, parts: Iterable[Segments], marching: Marching) -> FrozenSamples:
@@ -198,8 +198,9 @@ class HierStyleModel(SceneModel):
         if look.mode == "baked" and not self.training:
             fine, coarse = self.baked.render(styles, segments, marching, background, look.mix)
         else:
-            directions, starts = ray_bundle.directions, range(0, len(ray_bundle), RAYS_PER_CALL)
-            parts = (self.shown(ray_bundle[start : start + RAYS_PER_CALL]).segments for start in starts)
+            most = sizes_for(self.device).marched_rays
+            directions, starts = ray_bundle.directions, range(0, len(ray_bundle), most)
+            parts = (self.shown(ray_bundle[start : start + most]).segments for start in starts)
             frozen = self._freeze(parts, marching)
             with autocast(self.device, self.config.precision):
                 fine, coarse = render.render_mixed(self.field, styles, frozen, directions, background, look.mix)

@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass, replace
 from typing import Dict, List, Mapping, Optional, Sequence, Tuple
 
-import psutil
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
@@ -19,6 +18,7 @@ from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, TrainingPix
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.render import accumulation_of, seen_behind
 from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
+from sparsestyle_ns.utils.device_sizes import bytes_to_keep
 from sparsestyle_ns.utils.distributed import gather_rays, num_processes, shard_rays
 from sparsestyle_ns.utils.progress import track
 
@@ -66,11 +66,8 @@ class SceneViews:
     ) -> None:
         self.model, self.samples_per_chunk = model, samples_per_chunk
         self.num_photos = len(manager.train_dataset)
-        if cache_gigabytes is None:
-            on_gpu = model.device.type == "cuda"
-            free = torch.cuda.mem_get_info()[0] if on_gpu else psutil.virtual_memory().available
-            cache_gigabytes = free / 2**30 / 4 / num_processes()
-        self._bytes_left = cache_gigabytes * 2**30
+        given = cache_gigabytes is not None
+        self._bytes_left = cache_gigabytes * 2**30 if given else bytes_to_keep(model.device) / num_processes()
         self.by_scale: Dict[float, List[ContentView]] = {scale: [] for scale in scales}
         novel = cameras_between(manager.train_dataset.cameras, novel_views)
         work = [(scale, view) for scale in scales for view in (*range(self.num_photos), *novel)]

@@ -1,11 +1,11 @@
 """Reading photos as cameras and phones store them, and bringing them to one size."""
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import List, Sequence, Tuple
 
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from sparsestyle_ns.data.photos import images_in
 from sparsestyle_ns.utils.errors import InputError
@@ -29,12 +29,14 @@ class Photo:
         image: RGB, or RGBA where any pixels are transparent.
         orientation: EXIF's, from 1 (upright) to 8; 1 where it says nothing.
         upright: whether `image` was turned by that; else it has the pixels as they are stored.
+        exif: all that EXIF says.
     """
 
     path: Path
     image: Image.Image
     orientation: int = 1
     upright: bool = True
+    exif: Image.Exif = field(default_factory=Image.Exif)
 
 
 @dataclass(frozen=True)
@@ -87,8 +89,10 @@ def read_photo(path: Path, upright: bool = True) -> Photo:
         data = path.read_bytes()
         with Image.open(io.BytesIO(data)) as image:
             image.load()  # by which Pillow turns a TIFF upright, and forgets the orientation
+            exif = image.getexif()
+            exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
             orientation, pixels = orientation_of(image), to_8_bits(image, data)
-            return Photo(path, as_upright(pixels, orientation) if upright else pixels, orientation, upright)
+            return Photo(path, as_upright(pixels, orientation) if upright else pixels, orientation, upright, exif)
     except UnknownPixelsError as error:
         raise InputError(f"{path} has {error}; save it as 8-bit RGB or grey, or take it out.") from error
     except UnidentifiedImageError as error:

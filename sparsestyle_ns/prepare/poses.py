@@ -8,12 +8,13 @@ from typing import Any, Callable, Dict, List, Optional, Sequence, Union
 
 import numpy as np
 
+from sparsestyle_ns.data.estimated import TRANSFORMS
 from sparsestyle_ns.data.llff import read_poses_bounds
 from sparsestyle_ns.data.reading import check_lenses, read_transforms
 from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, Photo, Size, read_photo
 from sparsestyle_ns.utils.errors import InputError
 
-POSES_BOUNDS, TRANSFORMS = "poses_bounds.npy", "transforms.json"
+POSES_BOUNDS = "poses_bounds.npy"
 ASPECT_TOLERANCE = 0.02
 """Share by which the aspect of a photo may differ from that of its pose: sizes are whole pixels."""
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
@@ -48,6 +49,10 @@ class LLFFPoses:
                 "for each, in the order of their names."
             )
         return list(found)
+
+    def summary(self) -> str:
+        """Where the poses are from, in a line."""
+        return f"Poses are those in {self.path}"
 
     def size(self, index: int) -> Optional[Size]:
         """Width and height of the photo that a pose was made for; None where the file doesn't say."""
@@ -137,6 +142,10 @@ class TransformsPoses:
         renamed = {Path(frame["file_path"]): name for frame, name in zip(self.used, names, strict=True)}
         listed = {split: map(Path, self.content.get(split, [])) for split in SPLITS}
         return {split: [renamed[path] for path in paths if path in renamed] for split, paths in listed.items()}
+
+    def summary(self) -> str:
+        """See `LLFFPoses.summary`."""
+        return f"Poses are those in {self.path}"
 
     def size(self, index: int) -> Optional[Size]:
         """See `LLFFPoses.size`."""

@@ -37,19 +37,22 @@ class EffectsOptions(CommandOptions):
 
 @dataclass
 class PrepareOptions(CommandOptions):
-    """Makes a scene of three to eight photos: of one size, and with camera poses.
+    """Makes a scene of three to eight photos, or of a video: of one size, and with camera poses.
+
+    Poses are those in a poses_bounds.npy or transforms.json beside the photos; without such a file they are estimated
+    from the photos alone, with the focal length that EXIF gives, if it does.
 
     Photos are turned upright as EXIF says. With poses from a file they stay as they are stored, because such poses are
     for the stored pixels, unless only the upright photo has the pose's shape.
 
     Prints what is wrong with the photos: too few features or matches, too little overlap, a camera that only turned, or
-    that only moved along its line of sight.
+    that only moved along its line of sight; and which photo to take next.
     """
 
     photos: Annotated[Path, tyro.conf.Positional]
-    """Folder of the photos: JPEG, PNG, WebP, TIFF, and HEIC where pillow-heif is installed."""
+    """Folder of the photos: JPEG, PNG, WebP, TIFF, and HEIC where pillow-heif is installed; or a video."""
     output: Path
     """Folder to write the scene to."""
-    poses: Literal["auto", "file", "colmap"] = "auto"
-    """Where the camera poses are from: a poses_bounds.npy or transforms.json beside the photos (file), COLMAP (colmap,
-    through ns-process-data), or the file if there is one, else COLMAP (auto)."""
+    poses: Literal["auto", "file", "estimate"] = "auto"
+    """Where the camera poses are from: a poses_bounds.npy or transforms.json beside the photos (file), the photos alone
+    (estimate), or the file if there is one, else the photos alone (auto)."""

@@ -30,6 +30,7 @@ from sparsestyle_ns.rendering import baked_kernels
 from sparsestyle_ns.rendering.mixing import STYLISED, Appearance, Mix, mixed
 from sparsestyle_ns.rendering.render import POINTS_PER_CALL, Background, PackedRender, composite, render_packed
 from sparsestyle_ns.rendering.visible_samples import Marching, visible_samples
+from sparsestyle_ns.utils.machine import numbers_on
 from sparsestyle_ns.utils.numba_kernels import even_parts, run_on_threads
 
 Shade = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points 8"]]
@@ -88,7 +89,8 @@ def shade_of(field: CoarseField, style: StylisedField, space: Space, precision: 
             density, feature = field.density_and_feature(points)
             feature = feature.float()
             fine_density, fine_color = style(style.locate(points), feature, density)
-            colors = [field.color(feature, points.new_tensor(way).expand_as(points)) for way in seen_from]
+            ways = numbers_on(seen_from, points.device, points.dtype)
+            colors = [field.color(feature, way.expand_as(points)) for way in ways]
             color = torch.stack(colors).mean(dim=0)
         return torch.cat([density[:, None], fine_density[:, None], fine_color, color], dim=-1)
 

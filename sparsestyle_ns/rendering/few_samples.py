@@ -93,9 +93,10 @@ def cut_into_stretches(
         reached = segments.hit[:, None] & (torch.exp(-depth.sum(dim=-1, keepdim=True)) > LEAST_WEIGHT)
         is_kept, s = torch.cat([is_kept, reached], dim=-1), torch.cat([s, end], dim=-1)
         depth, lengths = F.pad(depth, (0, 1)), F.pad(lengths, (0, 1), value=torch.inf)
-    rays, _ = is_kept.nonzero(as_tuple=True)
-    s = s[is_kept]
-    return Stretches(PackedSamples(rays, s, lengths[is_kept], segments.positions(s, rays)), depth[is_kept])
+    # Where they are is asked for once: a GPU is waited for with every mask.
+    kept = is_kept.nonzero(as_tuple=True)
+    s, lengths, depth = (values[kept] for values in (s, lengths, depth))
+    return Stretches(PackedSamples(kept[0], s, lengths, segments.positions(s, kept[0])), depth)
 
 
 def _looked_at(

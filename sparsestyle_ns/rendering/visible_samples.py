@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sparsestyle_ns.core.occupancy import Occupancy, PackedSamples, march
 from sparsestyle_ns.core.spaces import Segments
-from sparsestyle_ns.core.volrend import optical_depth
+from sparsestyle_ns.core.volrend import optical_depth, ray_borders
 from sparsestyle_ns.rendering.few_samples import FewSamples
 
 SAMPLES_PER_PASS = 6
@@ -51,11 +51,12 @@ def visible_samples(
     """
     samples = march(segments, marching.occupancy, marching.num_steps, marching.unbounded)
     on_ray, num_rays = samples.ray_indices, len(segments.hit)
-    counts = torch.bincount(on_ray, minlength=num_rays)
-    rank = torch.arange(len(on_ray), device=on_ray.device) - (torch.cumsum(counts, dim=0) - counts)[on_ray]
+    borders = ray_borders(on_ray, num_rays)
+    rank = torch.arange(len(on_ray), device=on_ray.device) - borders[on_ray]
     depth = samples.s.new_zeros(num_rays)
     found: List[Tuple[Tensor, Tensor, Tensor]] = []
-    for first in range(0, max(1, int(counts.max())), SAMPLES_PER_PASS):
+    # A GPU is waited for here, and three times in each pass: how much is left decides how much is evaluated.
+    for first in range(0, max(1, int(borders.diff().max())), SAMPLES_PER_PASS):
         goes_on = torch.exp(-depth) > marching.min_transmittance
         in_pass = (rank >= first) & (rank < first + SAMPLES_PER_PASS) & goes_on[on_ray]
         index = in_pass.nonzero().squeeze(-1)
@@ -65,7 +66,7 @@ def visible_samples(
         depths[place] = optical_depth(density, samples.lengths[index])
         behind = depth[:, None] + depths.cumsum(dim=1)
         in_front = torch.cat([depth[:, None], behind[:, :-1]], dim=1)
-        seen = torch.exp(-in_front)[place] > marching.min_transmittance
+        seen = (torch.exp(-in_front)[place] > marching.min_transmittance).nonzero().squeeze(-1)
         depth = behind[:, -1]
         found.append((index[seen], density[seen], feature[seen]))
     index, density, feature = (torch.cat(parts) for parts in zip(*found, strict=True))

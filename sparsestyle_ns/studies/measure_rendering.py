@@ -19,7 +19,7 @@ from sparsestyle_ns.core.precision import Precision, multiplies_bfloat16, multip
 from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.engine.trainer import SparseStyleTrainerConfig
 from sparsestyle_ns.models.coarse_fewshot import CoarseFewShotModel
-from sparsestyle_ns.models.hier_style import RAYS_PER_CALL, HierStyleModel
+from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.rendering.baked import BakedVolume, render_baked
 from sparsestyle_ns.rendering.few_samples import Stretches, cut_into_stretches
 from sparsestyle_ns.rendering.render import POINTS_PER_CALL, render_packed
@@ -27,6 +27,7 @@ from sparsestyle_ns.studies.curves import Curve, Values, decibels, observed_orde
 from sparsestyle_ns.studies.study import with_setting
 from sparsestyle_ns.studies.time_budget import Budget, Case, Plan, in_turns
 from sparsestyle_ns.studies.workbench import Workbench, setting_curve
+from sparsestyle_ns.utils.device_sizes import SIZES
 
 Colors = Float[Tensor, "rays 3"]
 Change = Callable[[], ContextManager[None]]
@@ -37,7 +38,7 @@ CONVERGED = 16
 REFERENCE_SHARE = 0.4
 """Part of the time that the converged render may take; the number of rays follows from it."""
 MIN_RAYS, MAX_RAYS = 64, 4096
-SAMPLES_PER_RAY = POINTS_PER_CALL // RAYS_PER_CALL
+SAMPLES_PER_RAY = POINTS_PER_CALL // SIZES["cpu"].marched_rays
 """By which rays are cut into batches as pictures are; with fewer at once, work of a batch would count too much."""
 FACTORS = (1 / 8, 1 / 4, 1 / 2, 1, 2)
 """Numbers of samples, as multiples of the preset's."""

@@ -13,11 +13,12 @@ import tempfile
 import threading
 import time
 from pathlib import Path
-from typing import Dict, List, Tuple
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import psutil
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 
 from sparsestyle_ns.utils.errors import InputError
 
@@ -30,6 +31,15 @@ def synchronize(device: torch.device) -> None:
     """Waits until a GPU has done what it was told."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
+
+
+def numbers_on(values: Sequence[Any], device: torch.device, dtype: Optional[torch.dtype] = None) -> Tensor:
+    """A tensor of a few numbers on a device, for whose copy nothing waits.
+
+    `torch.tensor(values, device=...)` waits until a GPU has done all that it was told. A copy that doesn't block
+    returns when the driver has taken the numbers over, from memory that isn't pinned too.
+    """
+    return torch.tensor(values, dtype=dtype).to(device, non_blocking=True)
 
 
 def release_memory() -> None:

@@ -6,9 +6,9 @@ from test_thinned_mlp import ALL, by_autograd, network, uneven_loss
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
-from sparsestyle_ns.field_components import blocked_mlp as module
 from sparsestyle_ns.field_components.blocked_mlp import blocked_mlp
 from sparsestyle_ns.field_components.thinned_mlp import Thinning, thin
+from sparsestyle_ns.utils.device_sizes import SIZES
 
 POINTS = 40
 
@@ -16,7 +16,7 @@ POINTS = 40
 @pytest.fixture(params=[10**6, POINTS, 7, 1])
 def block(request, monkeypatch):
     """Points at once: all, just all, several blocks of which the last is shorter, and one by one."""
-    monkeypatch.setitem(module.BLOCK, "cpu", request.param)
+    monkeypatch.setitem(SIZES, "cpu", SIZES["cpu"]._replace(mlp_points=request.param))
 
 
 def two_inputs(count=POINTS, dtype=torch.float64):
@@ -50,7 +50,7 @@ def test_values_and_gradients_are_those_of_the_layers_however_many_points_there_
 
 
 def test_gradients_are_those_of_finite_differences(monkeypatch):
-    monkeypatch.setitem(module.BLOCK, "cpu", 4)
+    monkeypatch.setitem(SIZES, "cpu", SIZES["cpu"]._replace(mlp_points=4))
     (hidden, heads), inputs = network(), two_inputs(6)
 
     def outputs(first, *_):

@@ -1,7 +1,4 @@
 import math
-import os
-import subprocess
-import sys
 import weakref
 
 import pytest
@@ -174,49 +171,6 @@ def test_the_cpus_kernels_and_the_readable_form_agree_in_values_and_gradients(fe
     torch.testing.assert_close(*values, atol=1e-6, rtol=1e-6)
     # A row that many corners share sums some tens of float32 numbers in another order.
     torch.testing.assert_close(*gradients, atol=1e-5, rtol=1e-5)
-
-
-COMPARE_TRITON = """
-import torch
-from sparsestyle_ns.field_components import hash_grid_kernels, hash_grid_triton
-both = hash_grid_triton, hash_grid_kernels
-torch.manual_seed(0)
-points = torch.cat([torch.rand(300, 3), torch.zeros(1, 3), torch.ones(1, 3)])
-for features in (1, 3, 4):
-    table, resolutions = torch.rand(3, 64, features), (4, 9, 16)
-    values = [kernels.gather(table, points, resolutions) for kernels in both]
-    torch.testing.assert_close(*values, atol=1e-6, rtol=1e-5)
-    grad = torch.randn_like(values[0])
-    sums = [kernels.scatter(grad, points, resolutions, table.shape) for kernels in both]
-    torch.testing.assert_close(*sums, atol=1e-5, rtol=1e-5)
-print("equal")
-"""
-
-
-def test_the_gpus_kernels_agree_with_the_cpus():
-    """In triton's interpreter, which runs them without a GPU."""
-    pytest.importorskip("triton", reason="triton comes with torch for CUDA only")
-    environment = {**os.environ, "TRITON_INTERPRET": "1"}
-    ended = subprocess.run([sys.executable, "-c", COMPARE_TRITON], env=environment, capture_output=True, text=True)
-    assert ended.stdout.split() == ["equal"], ended.stderr
-
-
-@pytest.mark.parametrize("name", ["_gather", "_scatter"])
-def test_the_gpus_kernels_compile_for_a_gpu(name):
-    """To machine code, which needs no GPU either."""
-    triton = pytest.importorskip("triton", reason="triton comes with torch for CUDA only")
-    from triton.backends.compiler import GPUTarget
-    from triton.compiler import ASTSource
-
-    from sparsestyle_ns.field_components import hash_grid_triton
-
-    function = getattr(hash_grid_triton, name)
-    constants = {"levels": 8, "table_size": 2**19, "features": 4, "padded": 4, "block": 128}
-    types = (
-        dict.fromkeys(function.arg_names[:4], "*fp32") | {"num_points": "i32"} | dict.fromkeys(constants, "constexpr")
-    )
-    source = ASTSource(fn=function, signature=types, constexprs=constants)
-    assert triton.compile(source, target=GPUTarget("cuda", 80, 32)).asm["cubin"]
 
 
 def test_without_kernels_the_readable_form_runs(monkeypatch, points):

@@ -1,7 +1,7 @@
 import torch
 
-from sparsestyle_ns.fields import coarse as pieces
 from sparsestyle_ns.fields.coarse import in_chunks
+from sparsestyle_ns.utils.device_sizes import SIZES
 
 
 def counted(calls):
@@ -13,7 +13,7 @@ def counted(calls):
 
 
 def test_pieces_give_what_all_at_once_gives(monkeypatch):
-    monkeypatch.setitem(pieces.POINTS_PER_CHUNK, "cpu", 4)
+    monkeypatch.setitem(SIZES, "cpu", SIZES["cpu"]._replace(mlp_points=4))
     points, values, calls = torch.rand(11, 3), torch.rand(11), []
     with torch.no_grad():
         results = in_chunks(counted(calls), points, values)
@@ -23,7 +23,7 @@ def test_pieces_give_what_all_at_once_gives(monkeypatch):
 
 
 def test_with_gradients_and_for_few_points_there_is_one_call(monkeypatch):
-    monkeypatch.setitem(pieces.POINTS_PER_CHUNK, "cpu", 4)
+    monkeypatch.setitem(SIZES, "cpu", SIZES["cpu"]._replace(mlp_points=4))
     calls = []
     in_chunks(counted(calls), torch.rand(11, 3), torch.rand(11))
     with torch.no_grad():

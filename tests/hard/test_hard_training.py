@@ -1,5 +1,6 @@
 """Training where numbers get out of hand: what isn't finite is never learned and never saved."""
 
+import contextlib
 import copy
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,12 +12,13 @@ import torch
 from conftest import TINY, TINY_STYLE, ns_train, only_run
 from hard.table import hard_case
 from PIL import Image
+from second_device import SecondDevice
 from torch import nn
 from torch.amp import GradScaler
 
 from sparsestyle_ns.core.occupancy import DensityGrid
 from sparsestyle_ns.engine.trainer import SparseStyleTrainer
-from sparsestyle_ns.engine.training import FusedAdamConfig
+from sparsestyle_ns.engine.training import FusedAdamConfig, MuonConfig
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline
 from sparsestyle_ns.runs.checkpoints import load_checkpoint, newest_checkpoint
@@ -177,6 +179,32 @@ def test_optimisers_skip_what_adam_cant_take(value, fused, max_norm):
     for name, part in optimizers.optimizers["fields"].state_dict()["state"][0].items():
         assert torch.equal(part, state[name]), name
     assert (step(1.0) < first).all()
+    assert optimizers.skipped() == (2, 0)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e25])
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_muon_skips_the_same_and_otherwise_is_torchs(value, device):
+    with SecondDevice() if device == "cuda" else contextlib.nullcontext() as second:
+        check_muon(value, device)
+    if second is not None:
+        assert [wait.kind for wait in second.waits if "skip_nonfinite" in wait.place] == ["tolist"]  # of `skipped`
+
+
+def check_muon(value, device):
+    ours, theirs = (nn.Parameter(torch.eye(4, device=device)[:3].clone()) for _ in range(2))
+    optimizers = FiniteOptimizers({"matrices": {"optimizer": MuonConfig(), "scheduler": None}}, {"matrices": [ours]})
+    settings = {key: value for key, value in vars(MuonConfig()).items() if key in ("lr", "eps", "momentum")}
+    plain = torch.optim.Muon([theirs], weight_decay=0.0, **settings)
+    for step, is_broken in enumerate((True, False, True, False)):  # also before there is any momentum
+        gradient = torch.rand(3, 4, generator=torch.Generator().manual_seed(step)).to(device)
+        diagonal = torch.eye(3, 4, device=device).bool()
+        ours.grad = torch.where(diagonal, value, gradient) if is_broken else gradient.clone()
+        optimizers.optimizer_scaler_step_some(GradScaler("cpu", enabled=False), ["matrices"])
+        if not is_broken:
+            theirs.grad = gradient.clone()
+            plain.step()
+        assert torch.equal(ours, theirs)
     assert optimizers.skipped() == (2, 0)
 
 

@@ -51,6 +51,7 @@ from sparsestyle_ns.rendering import baked, frozen_view, mixing, visible_samples
 from sparsestyle_ns.rendering import render as volume
 from sparsestyle_ns.style import backbones, color
 from sparsestyle_ns.style.painting import Painting
+from sparsestyle_ns.utils.device_sizes import SIZES
 
 PACKAGES = [
     sparsestyle_ns.core,
@@ -167,7 +168,7 @@ def test_weights_are_shares_of_the_light(data, num_rays, samples, dtype):
     assert gradient.isfinite().all()
 
 
-@covers(compositing.packed_transmittance, compositing.packed_weights, compositing.packed_sum)
+@covers(compositing.packed_transmittance, compositing.packed_weights, compositing.packed_sum, compositing.ray_borders)
 @given(st.data(), st.integers(0, 60), ALL_FLOATS)
 def test_packed_samples_are_the_dense_ones_of_each_ray(data, samples, dtype):
     ray_indices, num_rays = packed_indices(data.draw, samples)
@@ -175,6 +176,7 @@ def test_packed_samples_are_the_dense_ones_of_each_ray(data, samples, dtype):
     light = compositing.packed_transmittance(depth, ray_indices, num_rays)
     weights = compositing.packed_weights(depth, ray_indices, num_rays)
     counts = torch.bincount(ray_indices, minlength=num_rays).tolist()
+    assert compositing.ray_borders(ray_indices, num_rays).diff().tolist() == counts
     expected = torch.cat([compositing.dense_weights(ray) for ray in depth.split(counts)])
     torch.testing.assert_close(weights, expected, rtol=1e-4, atol=1e-7)
     assert (light >= 0).all() and (light <= 1 + 1e-6).all()
@@ -447,7 +449,7 @@ def test_blocks_of_points_have_the_values_of_the_layers(count, block, width, dep
     heads = [torch.nn.Linear(7, channels, dtype=torch.float64) for channels in (3, 1)]
     inputs = [torch.randn(count, size, dtype=torch.float64) for size in (width, 2)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(blocked_mlp.BLOCK, "cpu", block)
+        patch.setitem(SIZES, "cpu", SIZES["cpu"]._replace(mlp_points=block))
         thinning = thinned_mlp.Thinning(threshold)
         found = blocked_mlp.blocked_mlp([inputs[0].requires_grad_(), inputs[1]], hidden, heads, thinning)
         (gradient,) = torch.autograd.grad(found.square().sum(), inputs[0])

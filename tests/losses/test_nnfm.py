@@ -7,6 +7,7 @@ from torch.utils._pytree import tree_leaves
 from sparsestyle_ns.losses import style_index
 from sparsestyle_ns.losses.nnfm import nearest_neighbors, nnfm_loss
 from sparsestyle_ns.losses.style_index import StyleIndex
+from sparsestyle_ns.utils.device_sizes import SIZES
 
 
 @pytest.fixture
@@ -266,7 +267,7 @@ def test_the_search_of_an_index_fills_no_tensor_larger_than_the_features(monkeyp
     style = StyleIndex(style_features, block_size=4)
     expected = style.nearest(features)
     monkeypatch.setattr(style_index, "TABLE_SIZE", 64)
-    monkeypatch.setitem(style_index.BOUNDED_AT_ONCE, "cpu", 6)
+    monkeypatch.setitem(SIZES, "cpu", SIZES["cpu"]._replace(bounded_vectors=6))
     with Operations(CHANNELS) as operations:
         found = style.nearest(features)
     assert torch.equal(found, expected)

@@ -1,13 +1,9 @@
 """`sparsestyle prepare`: scenes that the dataparsers read, poses that still fit the photos, and clear words if not."""
 
 import json
-import os
-import stat
-import textwrap
 
 import numpy as np
 import pytest
-import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from photo_sets import (
     ASIDE,
@@ -44,52 +40,6 @@ def change_transforms(folder, change):
     content = json.loads((folder / "transforms.json").read_text())
     change(content)
     (folder / "transforms.json").write_text(json.dumps(content))
-
-
-def install_fake(folder, name, script):
-    """A program on a PATH of its own."""
-    folder.mkdir(exist_ok=True)
-    path = folder / name
-    path.write_text(script)
-    path.chmod(path.stat().st_mode | stat.S_IXUSR)
-
-
-@pytest.fixture
-def no_colmap(tmp_path, monkeypatch):
-    (tmp_path / "bin").mkdir()
-    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
-
-
-@pytest.fixture
-def colmap(tmp_path, monkeypatch):
-    """A colmap, and an ns-process-data that places the photos `PLACED` and notes what it was called with."""
-    install_fake(tmp_path / "bin", "colmap", "#!/bin/sh\n")
-    install_fake(tmp_path / "bin", "ffmpeg", "#!/bin/sh\n")
-    script = """\
-        #!/usr/bin/env python3
-        import json, os, pathlib, shutil, sys
-        arguments = sys.argv[1:]
-        data, output = (pathlib.Path(arguments[arguments.index(flag) + 1]) for flag in ("--data", "--output-dir"))
-        pathlib.Path(os.environ["NOTES"]).write_text(json.dumps(arguments))
-        placed = json.loads(os.environ["PLACED"])
-        if not placed:
-            sys.exit("could not find an initial pair")
-        (output / "images").mkdir()
-        frames = []
-        for number, photo in enumerate(sorted(data.iterdir()), start=1):
-            name = f"frame_{number:05d}{photo.suffix}"
-            shutil.copy(photo, output / "images" / name)
-            pose = [[1, 0, 0, number], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-            if number in placed:
-                frames.append({"file_path": f"images/{name}", "transform_matrix": pose})
-        intrinsics = {"fl_x": 272, "fl_y": 272, "cx": 160, "cy": 120, "w": 320, "h": 240}
-        (output / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
-        """
-    install_fake(tmp_path / "bin", "ns-process-data", textwrap.dedent(script))
-    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setenv("NOTES", str(tmp_path / "notes.json"))
-    monkeypatch.setenv("PLACED", "[1, 2, 3]")
-    return tmp_path / "notes.json"
 
 
 @pytest.mark.parametrize("place", ["", "images"])
@@ -207,60 +157,30 @@ def test_a_photo_is_turned_upright_where_only_so_it_has_the_shape_of_its_pose(tm
     np.testing.assert_array_equal(np.asarray(prepared), np.asarray(photo(ASIDE[0])))
 
 
-def test_without_poses_and_colmap_one_sentence_names_the_ways_out(tmp_path, no_colmap, capsys):
+def test_photos_without_poses_are_turned_upright_and_become_a_scene(tmp_path, capsys):
     write_photos(tmp_path / "photos")
-    with pytest.raises(SystemExit) as ended:
-        main(["prepare", str(tmp_path / "photos"), "--output", str(tmp_path / "scene")])
-    for way in ("COLMAP", "apt install colmap", "poses_bounds.npy", "transforms.json"):
-        assert way in ended.value.code
-    assert "\n" not in ended.value.code
-    assert not (tmp_path / "scene").exists()
-
-
-def test_what_is_wrong_with_the_photos_is_said_before_colmap_is_missed(tmp_path, no_colmap, capsys):
-    write_photos(tmp_path / "photos", TURNED)
-    with pytest.raises(InputError, match="COLMAP"):
-        prepare_scene(tmp_path / "photos", tmp_path / "scene")
-    assert "Warning: The camera turned without moving" in capsys.readouterr().out
-
-
-def test_colmap_gets_upright_photos_of_one_size(tmp_path, colmap, capsys):
-    write_photos(tmp_path / "photos", suffix=".jpg")
-    turned = photo(ASIDE[0]).rotate(90, expand=True).resize((480, 640))
-    save_with_orientation(turned, tmp_path / "photos" / "a.jpg", 6)
+    turned = photo(ASIDE[0]).rotate(90, expand=True).resize((480, 640), Image.Resampling.BICUBIC)
+    save_with_orientation(turned, tmp_path / "photos" / "a.png", 6)
     main(["prepare", str(tmp_path / "photos"), "--output", str(tmp_path / "scene")])
     printed = capsys.readouterr().out.splitlines()
-    assert printed[0] == "a.jpg: turned upright, as EXIF says"
-    assert printed[-1].endswith("nerfstudio-data")
-    arguments = json.loads(colmap.read_text())
-    assert arguments[0] == "images"
-    assert arguments[arguments.index("--matching-method") + 1] == "exhaustive"
-    assert ("--gpu" in arguments) == torch.cuda.is_available()
-    outputs = parse_nerfstudio(tmp_path / "scene")
+    assert printed[0] == "a.png: turned upright, as EXIF says"
+    assert printed[-1].endswith(f"ns-train coarse-fewshot --data {tmp_path / 'scene'} llff-data")
+    outputs = parse_llff(tmp_path / "scene")
     assert [Image.open(path).size for path in outputs.image_filenames] == [(WIDTH, HEIGHT)] * 3
 
 
-def test_photos_that_colmap_could_not_place_are_named(tmp_path, colmap, monkeypatch, capsys):
-    write_photos(tmp_path / "photos", [*ASIDE, TURNED[0]])
-    monkeypatch.setenv("PLACED", "[1, 3, 4]")
-    scene = prepare_scene(tmp_path / "photos", tmp_path / "scene")
-    assert len(scene.names) == 3
-    assert "COLMAP couldn't tell where b.png was taken" in capsys.readouterr().out
-
-
-def test_where_colmap_fails_the_photos_faults_are_the_answer(tmp_path, colmap, monkeypatch):
+def test_where_poses_cant_be_estimated_the_photos_faults_are_the_answer(tmp_path):
     write_photos(tmp_path / "photos", TURNED)
-    monkeypatch.setenv("PLACED", "[]")
-    with pytest.raises(InputError, match=r"0 of 3 photos.*initial pair.*The camera turned without moving"):
+    with pytest.raises(InputError, match=r"can't be told\. The camera turned without moving"):
         prepare_scene(tmp_path / "photos", tmp_path / "scene")
     assert not (tmp_path / "scene").exists()
 
 
-def test_poses_may_be_asked_of_colmap_though_a_file_has_some(tmp_path, colmap):
+def test_poses_may_be_estimated_though_a_file_has_some(tmp_path):
     write_photos(tmp_path / "photos")
     write_poses_bounds(tmp_path / "photos")
-    assert prepare_scene(tmp_path / "photos", tmp_path / "scene", "colmap").parser == "nerfstudio-data"
-    assert colmap.exists()
+    prepare_scene(tmp_path / "photos", tmp_path / "scene", "estimate")
+    assert json.loads((tmp_path / "scene" / "transforms.json").read_text())["poses_estimated"] is True
 
 
 @pytest.mark.parametrize(
