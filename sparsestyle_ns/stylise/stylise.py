@@ -63,7 +63,7 @@ class _Way:
         self.scene = options.photos.resolve() if self.is_scene else options.output / f"scene-{self.photos}"
         self.outputs = options.output / "outputs"
         coarse = f"coarse-{_short_digest(self.method(COARSE_METHOD), options.seed, options.device, self.photos)}"
-        style = _short_digest(coarse, digest(options.painting.read_bytes()))
+        style = _short_digest(coarse, digest(options.painting.read_bytes()), options.stroke_size)
         style = f"{safe_file_name(options.painting.stem, 'style')}-{style}"
         self.coarse, self.stylised = (
             self.outputs / self.scene.stem / self.method(kind) / name
@@ -86,6 +86,8 @@ class _Way:
     def paint(self) -> List[Command]:
         """Stage 2."""
         flags = ["--style-image", str(self.options.painting), "--coarse-run", str(self.coarse)]
+        if self.options.stroke_size != StyliseOptions.stroke_size:
+            flags += ["--stroke-size", f"{self.options.stroke_size:g}"]
         return self._train(self.stylised, flags, "pipeline.seed")
 
     def _train(self, run: Path, flags: Command, own_seed: str) -> List[Command]:

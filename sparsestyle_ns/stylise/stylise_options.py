@@ -28,6 +28,8 @@ class StyliseOptions(CommandOptions):
     """Which methods train: default for pictures to keep, draft for a first look in a quarter of the time."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to train; auto is the GPU where there is one."""
+    stroke_size: float = 1.0
+    """How wide strokes are, from 0.5 to 2."""
     seed: int = 42
     """Of all that is drawn at random in training."""
 
@@ -37,6 +39,8 @@ class StyliseOptions(CommandOptions):
             raise InputError(f"There is no folder {self.photos}; name the folder of the photos.")
         if not self.painting.is_file():
             raise InputError(f"There is no painting {self.painting}; name a JPEG, PNG or WebP file.")
+        if not 0.5 <= self.stroke_size <= 2.0:
+            raise InputError(f"--stroke-size is {self.stroke_size:g}; give a number from 0.5 to 2.")
         if self.seed < 0:
             raise InputError(f"--seed is {self.seed}; give 0 or more.")
         try:

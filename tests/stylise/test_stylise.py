@@ -17,6 +17,7 @@ from sparsestyle_ns.stylise import stylise as stylise_module
 from sparsestyle_ns.stylise.stylise import make_stages
 from sparsestyle_ns.stylise.stylise_options import StyliseOptions
 from sparsestyle_ns.utils import stages as stages_module
+from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.stages import StageFailedError
 
 
@@ -101,6 +102,15 @@ def test_it_is_five_commands(photos, painting, monkeypatch, capsys):
     assert stylised.name.startswith("hat-") and f"--timestamp {stylised.name}" in style
     assert export.startswith(f"sparsestyle export {stylised} --output-path {out / 'scene.html'}")
     assert capsys.readouterr().out.splitlines()[-1].startswith(f"Made {out / 'index.html'} – next: ")
+
+
+def test_strokes_of_another_size_are_another_run_of_the_same_scene(photos, painting):
+    usual, wide = (commands_of(options(photos, painting, stroke_size=size)) for size in (1.0, 2.0))
+    assert usual[1] == wide[1] and "--stroke-size" not in usual[2] and "--stroke-size 2" in wide[2]
+    run_of = [command.split("--timestamp ")[1].split()[0] for command in (usual[2], wide[2])]
+    assert run_of[0] != run_of[1]
+    with pytest.raises(InputError, match="--stroke-size is 3; give a number"):
+        options(photos, painting, stroke_size=3.0).check()
 
 
 def test_a_scene_is_used_as_it_is(tmp_path, painting):
