@@ -1,6 +1,7 @@
 """Lets every test say `from reference import ...`, and makes small scenes and runs that several tests look at."""
 
 import shutil
+import signal
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "data_scripts")]
 pytest_plugins = ["hard.table"]
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as behind `&` in a script; commands that tests start inherit it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The same few examples in each run; `pytest --hypothesis-profile thorough` looks for new ones.
 hypothesis.settings.register_profile(

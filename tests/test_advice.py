@@ -509,7 +509,7 @@ TABLE = [
         "sparsestyle evaluate {coarse} --output-path a.json",
     ),
     Advice(
-        "is for its own painting; name a file with --output-path",
+        " in the run's folder is for its own ",
         "sparsestyle evaluate {style} --style-image {painting}",
         "sparsestyle evaluate {style} --style-image {painting} --output-path a.json",
     ),
@@ -600,8 +600,40 @@ TABLE = [
         lambda place: typed(f"sparsestyle prepare {photos(place)} --output photos", place),
         "sparsestyle prepare photos --output made",
     ),
+    Advice("leave --poses file out", None, None),  # tests/prepare
     Advice("pip install pillow-heif", read_heic, None),
     Advice("`pip install imageio-ffmpeg`", without_ffmpeg, None),
+    Advice("leave that out, as photos are reduced to --max-image-side", None, None),  # tests/data/test_colmap.py
+    # Models
+    Advice("ends rays; leave it out", coarse("--pipeline.model.enable-collider True"), coarse("")),
+    Advice(
+        "--eval-num-rays-per-chunk is ",
+        coarse("--pipeline.model.eval-num-rays-per-chunk 0"),
+        coarse("--pipeline.model.eval-num-rays-per-chunk 1"),
+    ),
+    # Known cameras, in tests/evaluation and tests/effects
+    Advice("--known-scene and --known-views go together", "sparsestyle evaluate {coarse} --known-scene {scene}", None),
+    Advice("--known-views names ", None, None),
+    # Exports
+    Advice(
+        "for a mesh as PLY take --format mesh",
+        "sparsestyle export {style} --format ply --mesh --output-path a.ply",
+        None,
+    ),
+    Advice(
+        " shows no scene; give 1000 or more",
+        "sparsestyle export {style} --format splat --max-splats 10 --output-path a.ply",
+        None,
+    ),
+    # ns-render, in tests/pipelines/test_render_command.py
+    Advice("--interpolation-steps and --frame-rate need 1 or more each", None, None),
+    Advice("so the flight is between the training views, as by --pose-source train", None, None),
+    Advice("render a path from the viewer with ns-render camera-path", None, None),
+    Advice("name one with --camera-path-filename", None, None),
+    # The whole way, in tests/stylise
+    Advice(" that this command didn't make; name another --output", None, None),
+    Advice("--seed is ", None, None),
+    Advice(" can't be made (", "sparsestyle stylise {scene} {painting} --output {painting}/made", None),
 ]
 """Where what is advised is to install something, or is tried by another test, nothing is run."""
 

@@ -102,6 +102,7 @@ class SparseStyleTrainer(Trainer, ABC):
     pipeline: CheckedPipeline
     stage: ClassVar[str]
     """What its bar is called."""
+    _interrupted = False
 
     @exit_on_input_error
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:

@@ -100,8 +100,10 @@ def read_camera_path(path: Path) -> Dict[str, Any]:
         raise InputError(f"{path} doesn't say in seconds, a number above 0, how long the film is: add it.")
     for side in ("render_height", "render_width"):
         value = content.get(side)
-        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= LONGEST_SIDE:
+        # nerfstudio's viewer may write 1080.0, which is whole.
+        if isinstance(value, bool) or not 1 <= _number(value) <= LONGEST_SIDE or int(value) != value:
             raise InputError(f"{path} has no {side} from 1 to {LONGEST_SIDE}, in whole pixels: correct it.")
+        content[side] = int(value)
     kind = content.get("camera_type", KINDS[0])
     if not isinstance(kind, str) or kind.lower() not in KINDS or (kind != kind.lower() and kind.lower() in KINDS[:3]):
         raise InputError(f"{path} has the camera_type {json.dumps(kind)[:60]}: name one of {', '.join(KINDS)}.")

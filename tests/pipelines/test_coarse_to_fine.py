@@ -152,7 +152,7 @@ def test_strokes_beyond_half_and_twice_are_refused(size, painting):
 def test_the_style_counts_more_for_an_object_on_a_background(training, monkeypatch):
     pipeline = training.pipeline
     _, everywhere = pipeline.losses(pipeline.task, 0)
-    monkeypatch.setattr(pipeline.model, "background", torch.ones(3))
+    monkeypatch.setitem(pipeline.model._buffers, "background", torch.ones(3))
     _, of_object = pipeline.losses(pipeline.task, 0)
     assert of_object.weights == {**everywhere.weights, "style": 4.0 * everywhere.weights["style"]}
 

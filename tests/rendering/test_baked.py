@@ -316,7 +316,7 @@ def test_a_volume_without_cells_is_refused():
 def test_segments_of_another_kind_have_no_compiled_form():
     class Spiral(Segments):
         hit = torch.ones(1, dtype=torch.bool)
-        positions = lengths = distance = at_distance = None
+        positions = lengths = distance = at_distance = _part = None
 
     with pytest.raises(TypeError, match="march_in_torch"):
         march_compiled([volume_of(trilinear)], Spiral(), Marching(None, STEPS, False, 0.0), None)

@@ -239,7 +239,10 @@ def test_what_can_not_be_used_is_said_in_one_sentence(tmp_path, arguments, sente
 def test_the_last_line_names_the_report_and_trains_on_the_scene(tmp_path, monkeypatch, capsys):
     (tmp_path / "poses_bounds.npy").touch()
     report = SimpleNamespace(
-        write=lambda folder: folder / "index.html", recommendation=["Take 4."], everything_left_out=lambda: []
+        write=lambda folder: folder / "index.html",
+        recommendation=["Take 4."],
+        everything_left_out=lambda: [],
+        left_out=[],
     )
     monkeypatch.setattr(tradeoff, "measure", lambda *_: report)
     options = TradeoffOptions(

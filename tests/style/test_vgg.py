@@ -286,7 +286,7 @@ def test_where_there_are_no_weights_the_error_names_all_three_ways_out(backbone,
     with pytest.raises(InputError) as caught:
         load_backbone(backbone)
     assert str(caught.value) == (
-        f"There are no weights for --backbone {backbone}: give a file with --vgg-weights, or put vgg16-397923af.pth "
+        f"There are no weights for --backbone {backbone}; give a file with --vgg-weights, or put vgg16-397923af.pth "
         f"into the folder {hub}, or use --backbone vgg16-shift-tolerant (or auto) with the package stlpips-pytorch "
         "installed."
     )
@@ -298,12 +298,12 @@ def test_where_there_are_no_weights_the_error_names_all_three_ways_out(backbone,
 )
 def test_a_file_of_the_other_network_is_refused(file, backbone, name, request):
     path = request.getfixturevalue(file)
-    with pytest.raises(InputError, match=f"is of {name}, not of {backbone}: give another file or --backbone"):
+    with pytest.raises(InputError, match=f"is of {name}, not of {backbone}; give another file or --backbone"):
         load_backbone(backbone, path)
 
 
 def test_a_missing_file_is_named_and_nothing_else_is_taken_instead(tmp_path, wheel):
-    with pytest.raises(InputError, match=r"no VGG weight file .*missing\.pth: check the path given as --vgg-weights"):
+    with pytest.raises(InputError, match=r"no VGG weight file .*missing\.pth; check the path given as --vgg-weights"):
         load_backbone("auto", tmp_path / "missing.pth")
 
 
@@ -311,7 +311,7 @@ def test_a_missing_file_is_named_and_nothing_else_is_taken_instead(tmp_path, whe
 def test_a_damaged_file_is_refused(kept, plain_file, tmp_path):
     (tmp_path / "damaged.pth").write_bytes(plain_file.read_bytes()[:kept])
     with pytest.raises(
-        InputError, match=r"damaged\.pth is damaged or not a PyTorch state dict: fetch it again"
+        InputError, match=r"damaged\.pth is damaged or not a PyTorch state dict; fetch it again"
     ) as caught:
         load_backbone("auto", tmp_path / "damaged.pth")
     assert "\n" not in str(caught.value)
