@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, List
@@ -60,7 +61,8 @@ def interrupt(command: List[str], moment: str, folder: Path, presses: int = 1, c
         _wait(lambda: here.exists() or not process.is_alive())
         assert here.exists(), f"{moment} was never called\n{log.read_text()[-3000:]}"
         for _ in range(presses):
-            os.kill(process.pid, signal.SIGINT)
+            with suppress(ProcessLookupError):  # it may end before the next press
+                os.kill(process.pid, signal.SIGINT)
             time.sleep(0.1)
         process.join(SECONDS)
         assert process.exitcode is not None, log.read_text()[-3000:]

@@ -17,7 +17,7 @@ from chromium import needs_chromium, open_tab
 
 PACKAGES = ("playcanvas@2.23.3", "gltf-validator@2.0.0-dev.3.10")
 """With the versions that were tried."""
-SETTLED_SECONDS = 2.0
+SETTLED_SECONDS = 6.0
 
 PLAYCANVAS = """<!doctype html><meta charset="utf-8"><style>body { margin: 0 }</style><canvas></canvas>
 <script type="module">
