@@ -104,7 +104,7 @@ COMMANDS = {
         "style",
         "sparsestyle_ns.models.hier_style:HierStyleModel.get_outputs",
     ),
-    "effects": ("sparsestyle effects --data {scene}", "coarse", "sparsestyle_ns.data.features:find_features"),
+    "effects": ("sparsestyle effects --data {scene}", "coarse", "sparsestyle_ns.data.matches:find_features"),
     "prepare": (
         "sparsestyle prepare {scene} --output {tmp}/a",
         "coarse",

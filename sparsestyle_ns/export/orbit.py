@@ -49,8 +49,7 @@ def pinholes(cameras: Cameras, longest: Optional[int] = None) -> Cameras:
     """The same cameras without distortion, which a page doesn't draw, with at most `longest` pixels a side."""
     names = ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height")
     plain = Cameras(**{name: getattr(cameras, name) for name in names}, camera_type=CameraType.PERSPECTIVE)
-    side = int(max(cameras.width.max(), cameras.height.max()))
-    if longest is not None and longest < side:
+    if longest is not None and longest < (side := int(max(cameras.width.max(), cameras.height.max()))):
         plain.rescale_output_resolution(longest / side)
     return plain
 

@@ -152,7 +152,7 @@ def test_an_effect_that_a_scene_calls_for_makes_held_out_views_better(scenes, la
 @pytest.mark.parametrize(
     "layout, options, steps, has_empty_space, is_haze",
     [
-        pytest.param("llff", (), 300, True, False, id="clear"),
+        pytest.param("llff", (), 600, True, False, id="clear"),
         # All photos are grey: what is learned is solid all over, nothing to skip and nothing doubtful.
         pytest.param("llff", ("--haze", "1"), 300, False, False, id="thick mist"),
         pytest.param("blender", (), 60, False, True, id="hardly trained"),

@@ -70,3 +70,8 @@ def test_cameras_are_only_made_smaller():
 def test_rotation_is_right_handed():
     turned_x = rotation(torch.tensor([0.0, 0.0, 1.0]), 90.0) @ torch.tensor([1.0, 0.0, 0.0])
     torch.testing.assert_close(turned_x, torch.tensor([0.0, 1.0, 0.0]), atol=1e-6, rtol=0)
+
+
+def test_no_cameras_stay_none():
+    none = pinholes(look_from((2.0, 0.1, 0.0))[torch.zeros(0, dtype=torch.long)])
+    assert len(none.camera_to_worlds) == 0
