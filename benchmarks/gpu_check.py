@@ -17,14 +17,13 @@ import traceback
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List, Optional, Tuple
+from typing import Any, Callable, Dict, Iterator, List, Tuple
 from unittest import mock
 
 import torch
 import tyro
 from torch import Tensor
 from torch.backends import cudnn
-from torch.overrides import TorchFunctionMode
 
 from benchmarks import summary
 from benchmarks._measure import ROOT, Options, commit, in_fresh_process, peak_bytes, write_json
@@ -74,16 +73,20 @@ class CheckFailedError(Exception):
 # ------------------------------------------------------------------------------------------- the same on both devices
 
 
-class DrawnOnCPU(TorchFunctionMode):
-    """Random numbers are drawn on the CPU wherever they are used, so that they are the same on every device."""
+def drawn_on_cpu(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """A function that draws random numbers, which with a generator draws them on the CPU: the same on every device.
 
-    def __torch_function__(self, func: Any, types: Any, args: Tuple = (), kwargs: Optional[Dict] = None) -> Any:
-        kwargs = dict(kwargs or {})
+    In the threads of backward passes too, to which torch's function modes don't reach.
+    """
+
+    def drawn(*args: Any, **kwargs: Any) -> Tensor:
         if kwargs.get("generator") is None:
-            return func(*args, **kwargs)
+            return function(*args, **kwargs)
         device = kwargs.pop("device", None)
-        drawn = func(*args, **kwargs)
-        return drawn if device is None else drawn.to(device)
+        found = function(*args, **kwargs)
+        return found if device is None else found.to(device)
+
+    return drawn
 
 
 @contextlib.contextmanager
@@ -92,7 +95,10 @@ def comparable() -> Iterator[None]:
     generator, before = torch.Generator, cudnn.allow_tf32
     cudnn.allow_tf32 = False
     try:
-        with mock.patch.object(torch, "Generator", lambda device=None: generator()), DrawnOnCPU():
+        with contextlib.ExitStack() as patches:
+            patches.enter_context(mock.patch.object(torch, "Generator", lambda device=None: generator()))
+            for name in ("rand", "randn", "randint", "randperm"):
+                patches.enter_context(mock.patch.object(torch, name, drawn_on_cpu(getattr(torch, name))))
             torch.manual_seed(0)
             yield
     finally:

@@ -15,7 +15,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))  # benchmarks isn't in
 from benchmarks import gpu_check
 from benchmarks._measure import ROOT
 from benchmarks._scene import Scene
-from benchmarks.gpu_check import CheckFailedError, DrawnOnCPU, GpuCheckOptions, comparable
+from benchmarks.gpu_check import CheckFailedError, GpuCheckOptions, comparable, drawn_on_cpu
 
 
 @pytest.fixture
@@ -89,8 +89,7 @@ def test_random_numbers_are_the_cpus_on_every_device():
             assert str(numbers.device).startswith(device)
             drawn[device] = numbers.tolist()
     assert drawn["cpu"] == drawn["cuda"]
-    with DrawnOnCPU():
-        assert torch.rand(2).shape == (2,)
+    assert drawn_on_cpu(torch.rand)(2).shape == (2,)
 
 
 @pytest.mark.slow
