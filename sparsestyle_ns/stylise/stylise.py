@@ -16,6 +16,7 @@ from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD, read_con
 from sparsestyle_ns.stylise.stylise_options import StyliseOptions
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import digest, safe_file_name
+from sparsestyle_ns.utils.interrupts import PRESSES, stop
 from sparsestyle_ns.utils.stages import FINISHED, Command, Stage, StageFailedError, clock, run_stages
 
 SECONDS = {"default": (15.0, 190.0, 290.0, 100.0, 80.0), "draft": (5.0, 65.0, 60.0, 40.0, 30.0)}
@@ -41,9 +42,8 @@ def stylise(options: StyliseOptions) -> None:
         durations = run_stages(options.output, make_stages(options))
     except StageFailedError as error:
         raise InputError(f"{error}\nThe same command goes on with this stage:\n  {again}") from error
-    except KeyboardInterrupt:
-        print(f"\nStopped; the same command goes on where it was:\n  {again}", file=sys.stderr)
-        raise SystemExit(130) from None
+    except PRESSES:
+        stop(f"Stopped; the same command goes on where it was:\n  {again}")
     for heading, seconds in durations:
         print(f"  {'before' if seconds is None else clock(seconds):>6}  {heading}")
     page = options.output / PAGES[0]

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import IO, Callable, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
 from sparsestyle_ns.utils.files import write_whole
+from sparsestyle_ns.utils.interrupts import PRESSES
 from sparsestyle_ns.utils.progress import PROGRESS_FILE, Bar, ProgressReport, bar, is_progress_line, say
 
 LINES_OF_A_FAILURE = 20
@@ -210,11 +211,11 @@ def run_command(
     with process:
         try:
             pass_on()
-        except KeyboardInterrupt:
+        except PRESSES:
             process.send_signal(signal.SIGINT)
             try:
                 pass_on()
-            except KeyboardInterrupt:  # a second one: at once
+            except PRESSES:  # a second one: at once
                 process.terminate()
             raise
         except BaseException:
