@@ -72,6 +72,7 @@ class HierStyleModel(SceneModel):
     """(σ_f, c_f) on top of a frozen (σ_c, e_c, c_c). Its state holds all that rendering needs."""
 
     config: HierStyleModelConfig
+    picture_names = ("rgb", "rgb_coarse", "accumulation", "depth", "accumulation_coarse", "depth_coarse")
 
     def populate_modules(self) -> None:
         """Builds both fields, and the grid that says what is empty."""

@@ -66,6 +66,23 @@ def ended_by_ctrl_c() -> Iterator[None]:
         stop(SENTENCE)
 
 
+@contextmanager
+def ending_on(*signals: signal.Signals) -> Iterator[None]:
+    """Signals that would end this process at once end it so that its command ends, too."""
+    before = {number: signal.signal(number, lambda number, _: sys.exit(128 + number)) for number in signals}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def stop_if_pressed() -> None:
+    """Ends the process if Ctrl-C was pressed before, whatever went wrong after that."""
+    if _pressed_at is not None:
+        raise StoppedByCtrlC
+
+
 def take_away_at_end(leftover: Callable[[], object]) -> None:
     """Calls a function at the end of the process, also where a second Ctrl-C ends it at once."""
     _leftovers.append(leftover)
