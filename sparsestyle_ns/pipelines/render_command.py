@@ -26,6 +26,8 @@ AROUND = ("equirectangular", "omnidirectional", "vr180")
 KINDS = ("perspective", "fisheye", *AROUND)
 LONGEST_SIDE = 16384
 """Pixels, that no film has."""
+FRAME_RATES = 0.01, 1000.0
+"""Frames a second that films can have."""
 EXPORT_AGAIN = "export it again from the viewer's Render tab"
 
 
@@ -85,6 +87,9 @@ def prepare_render(pipeline: VanillaPipeline) -> None:
             say("The scene is forward-facing: what a camera sees beside and behind the photos' views is empty.")
     if hasattr(command, "pose_source"):
         find_ends(pipeline, command)
+    if hasattr(command, "radius"):  # nerfstudio multiplies them by poses, which are of single precision
+        cameras = pipeline.datamanager.eval_dataloader.cameras
+        cameras.fx, cameras.fy = cameras.fx.float(), cameras.fy.float()
     if hasattr(command, "pose_source") or hasattr(command, "radius"):
         is_train = getattr(command, "pose_source", "eval") == "train"
         cameras = (pipeline.datamanager.train_dataset if is_train else pipeline.datamanager.eval_dataset).cameras
@@ -176,6 +181,11 @@ def read_camera_path(path: Path) -> Dict[str, Any]:
         raise InputError(f"{path} has no cameras in camera_path: add keyframes in the viewer, and {EXPORT_AGAIN}.")
     if not _number(content.get("seconds")) > 0:
         raise InputError(f"{path} doesn't say in seconds, a number above 0, how long the film is: add it.")
+    if not FRAME_RATES[0] <= len(keyframes) / content["seconds"] <= FRAME_RATES[1]:
+        raise InputError(
+            f"{path} shows {len(keyframes)} frames in {content['seconds']:g} seconds, and a film has from "
+            f"{FRAME_RATES[0]:g} to {FRAME_RATES[1]:g} a second: correct seconds."
+        )
     for side in ("render_height", "render_width"):
         value = content.get(side)
         # nerfstudio's viewer may write 1080.0, which is whole.
