@@ -93,6 +93,11 @@ def test_in_training_the_iteration_is_finished_and_saved(llff_scene, tmp_path, m
     assert " – next: " in ending.printed.splitlines()[-1]
 
 
+STUDIES = {
+    "tradeoff": " before anything was measured.",
+    **dict.fromkeys(("compare", "ablate"), "; the same command goes on where it was."),
+}
+"""What studies say more than other commands."""
 FRAME = "sparsestyle_ns.models.hier_style:HierStyleModel.get_outputs"
 COMMANDS = {
     "a film": ("ns-render interpolate --pose-source train --output-path {tmp}/a/b.mp4", "style", FRAME, 5),
@@ -108,13 +113,8 @@ COMMANDS = {
         FRAME,
         5,
     ),
-    "pictures of views": ("ns-render dataset --split train --output-path {tmp}/a", "style", FRAME, 5),
-    "cloud": (
-        "ns-export pointcloud --output-dir {tmp}/a --normal-method open3d --num-points 100000",
-        "style",
-        "sparsestyle_ns.pipelines.datamanager:FewShotDataManager.next_train",
-        2,
-    ),
+    "pictures of views": ("ns-render dataset --split train --output-path {tmp}/a", "style", FRAME, 2),
+    "cloud": ("ns-export pointcloud --output-dir {tmp} --normal-method open3d --num-points 100000", "style", FRAME, 3),
     "tradeoff": (
         "sparsestyle tradeoff --data {scene} --output-dir {tmp}/a",
         "coarse",
@@ -167,7 +167,8 @@ def test_other_commands_make_nothing(runs, llff_scene, painting, tmp_path, case)
         command += ["--load-config", str(run / "config.yml")]
     before = {path for path in runs.outputs.rglob("*")}
     (tmp_path / "made").mkdir()
-    interrupt(command, moment, tmp_path / "log", 2, *call).assert_told()
+    sentence = "Stopped by Ctrl-C" + STUDIES.get(command[1], ".")
+    interrupt(command, moment, tmp_path / "log", 2, *call).assert_told(sentence)
     assert not list((tmp_path / "made").iterdir())
     assert {path for path in runs.outputs.rglob("*")} == before
 
