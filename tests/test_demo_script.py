@@ -143,3 +143,25 @@ def test_impossible_option_is_refused(capsys):
         demo.main(["--frames", "0"])
     assert ended.value.code == 2
     assert "--frames is 0, but has to be at least 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", demo.PRODUCTS)
+def test_a_folder_with_files_of_ones_own_is_refused_and_stays(tmp_path, capsys, name):
+    (tmp_path / name).mkdir() if "." not in name else (tmp_path / name).write_text("mine")
+    assert demo.main(["--output", str(tmp_path)]) == 1
+    assert f"has a {name} that isn't the demo's; name a new folder with --output." in capsys.readouterr().err
+    assert [path.name for path in tmp_path.rglob("*")] == [name]
+
+
+def test_other_files_may_lie_in_the_demos_folder(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    demo.claim_folder(tmp_path)
+    (tmp_path / "style.png").touch()
+    demo.claim_folder(tmp_path)  # which is the demo's own by now
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_a_file_in_place_of_the_folder_is_said(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert demo.main(["--output", str(tmp_path / "file")]) == 1
+    assert "can't be used" in capsys.readouterr().err
