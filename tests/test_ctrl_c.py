@@ -265,3 +265,28 @@ def test_other_methods_keep_nerfstudios_ways(monkeypatch, tmp_path, words, is_gu
     )
     interrupts.guard_nerfstudio(("coarse-fewshot", "hier-style"))
     assert bool(guarded) is is_guarded
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("ns-render interpolate --load-config {run}", r"is a folder; give .*/hier-style/a/config\.yml\."),
+        ("ns-viewer --load-config {run}/confg.yml", "There is no run's config at"),
+        ("ns-eval --load-config={run}b/config.yml", "There is no run's config at"),
+        ("ns-eval --load-config {run}/config.yml", None),
+        ("ns-eval --load-config elsewhere/nerfacto/a", None),
+        ("ns-eval", None),
+    ],
+)
+def test_a_run_that_is_not_there_is_said_where_it_would_be_one_of_these_methods(monkeypatch, tmp_path, words, sentence):
+    run = tmp_path / "hier-style" / "a"
+    run.mkdir(parents=True)
+    (run / "config.yml").write_text("method_name: hier-style\n")
+    monkeypatch.setattr(interrupts, "end_on_ctrl_c", lambda: None)
+    monkeypatch.chdir("/")
+    monkeypatch.setattr(sys, "argv", words.format(run=run).split())
+    if sentence is None:
+        interrupts.guard_nerfstudio(("coarse-fewshot", "hier-style"))
+        return
+    with pytest.raises(SystemExit, match=sentence):
+        interrupts.guard_nerfstudio(("coarse-fewshot", "hier-style"))

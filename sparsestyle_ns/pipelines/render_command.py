@@ -109,9 +109,9 @@ def _check_names(pipeline: VanillaPipeline, command: Any) -> None:
         raise InputError(f"--rendered-output-names {what}; choose from {', '.join([*known, 'rgba'])}.")
     is_png = getattr(command, "output_format", "images") == "images" and command.image_format == "png"
     if "rgba" in (names or []) and not (is_png and (is_dataset or names == ["rgba"])):
-        alone = "" if is_dataset else " alone, with --output-format images and"
         raise InputError(
-            f"Of --rendered-output-names, rgba can only be a PNG file; render it{alone or ' with'} --image-format png."
+            "Of --rendered-output-names, rgba can only be a PNG file of its own; render it with --image-format png"
+            + ("." if is_dataset else ", --output-format images, and no other name.")
         )
 
 
