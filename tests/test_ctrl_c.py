@@ -123,7 +123,7 @@ COMMANDS = {
     "compare": (
         "sparsestyle compare --data {scene} --style-images {painting} --output-path {tmp}/a.html --output-dir {tmp}/o",
         "coarse",
-        "sparsestyle_ns.studies.run_queue:RunQueue.train",
+        "sparsestyle_ns.studies.run_queue:RunQueue._train",
     ),
     "ablate": (
         "sparsestyle ablate --data {scene} --style-images {painting} --output-path {tmp}/a.html --output-dir {tmp}/o",

@@ -165,3 +165,15 @@ def test_a_file_in_place_of_the_folder_is_said(tmp_path, capsys):
     (tmp_path / "file").touch()
     assert demo.main(["--output", str(tmp_path / "file")]) == 1
     assert "can't be used" in capsys.readouterr().err
+
+
+def test_the_film_of_an_earlier_demo_makes_room(tmp_path, monkeypatch):
+    (tmp_path / "outputs" / "llff" / "hier-style-draft" / "a").mkdir(parents=True)
+    (tmp_path / "outputs" / "llff" / "hier-style-draft" / "a" / "config.yml").touch()
+    for name in ("stylised.mp4", "stylised/00000.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    monkeypatch.setattr(demo, "flight", lambda *_: {})
+    film, pictures = demo.make_stages(demo.Options(output=tmp_path, images=True))[4].commands()
+    assert not (tmp_path / "stylised.mp4").exists() and not (tmp_path / "stylised").exists()
+    assert film[film.index("--output-path") + 1] == pictures[pictures.index("--output-path") + 1]
