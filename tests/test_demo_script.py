@@ -177,3 +177,27 @@ def test_the_film_of_an_earlier_demo_makes_room(tmp_path, monkeypatch):
     film, pictures = demo.make_stages(demo.Options(output=tmp_path, images=True))[4].commands()
     assert not (tmp_path / "stylised.mp4").exists() and not (tmp_path / "stylised").exists()
     assert film[film.index("--output-path") + 1] == pictures[pictures.index("--output-path") + 1]
+
+
+def test_after_ctrl_c_the_same_command_goes_on_with_the_stage_under_way(tmp_path, monkeypatch, capsys):
+    from sparsestyle_ns.utils import stages
+
+    begun = []
+
+    def run(command, heading, *_):
+        begun.append(heading)
+        if heading.startswith("Painting") and begun.count(heading) == 1:
+            raise KeyboardInterrupt
+        for product in ("scene/llff/a", "style.png"):
+            (tmp_path / product).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / product).touch()
+
+    monkeypatch.setattr(stages, "run_command", run)
+    every_stage = demo.make_stages
+    monkeypatch.setattr(demo, "make_stages", lambda options: every_stage(options)[:2])
+    monkeypatch.setattr(demo, "newest_run", lambda *_: tmp_path)
+    command = ["--output", str(tmp_path)]
+    assert demo.main(command) == 130
+    assert "the same command goes on with the stage that was under way." in capsys.readouterr().err
+    assert demo.main(command) == 0
+    assert [heading.split()[0] for heading in begun] == ["Photographing", "Painting", "Painting"]
