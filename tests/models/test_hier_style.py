@@ -63,7 +63,7 @@ def model():
 
 
 def test_an_object_on_a_background_has_more_cells():
-    assert make_untrained(object_cells=2.0).residual.encoding.resolutions == (4, 16)
+    assert make_untrained(object_cells=2.0).residual.grid.resolutions == (4, 16)
 
 
 @torch.no_grad()
