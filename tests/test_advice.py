@@ -656,6 +656,13 @@ TABLE = [
     Advice("; choose from ", views("foo"), views("rgb")),
     Advice("rgba can only be a PNG file", views("rgba"), views("rgba --image-format png")),
     Advice(
+        "--output-format images, and no other name",
+        flight("--rendered-output-names rgba"),
+        flight("--rendered-output-names rgba --image-format png"),
+    ),
+    Advice(" is a folder; give ", None, None),  # tests/test_ctrl_c.py, as the next
+    Advice("There is no run's config at --load-config ", None, None),
+    Advice(
         "Something is at --output-path ",
         lambda place: into_pictures("pictures", place),
         views("rgb --output-path pictures-2"),
