@@ -16,7 +16,7 @@ from torchvision.transforms.functional import to_tensor
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.export.orbit import turned
-from sparsestyle_ns.export.voxel_grid import EMPTY, VoxelGrid, picture_of_voxels
+from sparsestyle_ns.export.voxel_grid import EMPTY, VoxelGrid, Voxels, picture_of_voxels
 from sparsestyle_ns.export.web_page import build_page, fit_page
 from sparsestyle_ns.utils.errors import InputError
 
@@ -24,10 +24,10 @@ READY = "document.body.dataset.state === 'ready'"
 SETTLED = "document.body.dataset.state !== 'moving'"
 
 
-def page_of(kind, title="A scene", names=None):
-    small = scene(kind)
-    small.title, small.names = title, names or small.names
-    return build_page(small.voxels, small, small.orbit)
+def page_of(kind, names=None, styles=1, **made):
+    small = scene(kind, styles)
+    vars(small).update(made, names=names or small.names)
+    return build_page(small.voxels, [small] * styles, small.orbit)
 
 
 def unpack(page):
@@ -38,16 +38,26 @@ def unpack(page):
     )
     told = json.loads(told)
     data = np.frombuffer(gzip.decompress(base64.b64decode(packed)), np.uint8)
-    sides = told["cells"], told["resolution"] + 1
-    occupied, known, planes = np.split(data, np.cumsum([-(-(side**3) // 8) for side in sides]))
-    occupied, known = (
+    styles, coarse = told["styles"], told["coarse"]
+    sides = told["cells"], styles[0]["resolution"] + 1, coarse["resolution"] + 1
+    *grids, planes = np.split(data, np.cumsum([-(-(side**3) // 8) for side in sides]))
+    occupied, known, coarse_known = (
         torch.from_numpy(np.unpackbits(bits, count=side**3, bitorder="little").astype(bool)).view(side, side, side)
-        for bits, side in zip((occupied, known), sides, strict=True)
+        for bits, side in zip(grids, sides, strict=True)
     )
-    codes = torch.zeros(*known.shape, 4, dtype=torch.uint8)
-    codes[..., 0] = EMPTY
-    codes[known] = torch.from_numpy(np.cumsum(planes.reshape(4, -1), axis=1, dtype=np.uint8).T.copy())
-    return told, VoxelGrid(codes, known, occupied)
+    each = [4 * field["known"] for field in (*styles, coarse)]
+    *parts, rest = np.split(planes, np.cumsum(each))
+    assert len(rest) == 0
+    tables = [np.cumsum(part.reshape(4, -1), axis=1, dtype=np.uint8) for part in parts]
+    for table in tables[1:-1]:
+        table[0] += tables[0][0]
+    fields = []
+    for table, where in zip(tables, [*[known] * len(styles), coarse_known], strict=True):
+        codes = torch.zeros(*where.shape, 4, dtype=torch.uint8)
+        codes[..., 0] = EMPTY
+        codes[where] = torch.from_numpy(table.T.copy())
+        fields.append(Voxels(codes, where))
+    return told, VoxelGrid(fields[:-1], fields[-1], occupied)
 
 
 def shown(tab):
@@ -61,12 +71,15 @@ def tab(tmp_path_factory):
         yield tab
 
 
-def test_what_is_packed_is_unpacked():
-    small = scene("box")
-    told, voxels = unpack(page_of("box"))
-    assert told["resolution"] == voxels.resolution == 31
-    for name in ("codes", "known", "occupied"):
-        assert torch.equal(getattr(voxels, name), getattr(small.voxels, name)), name
+@pytest.mark.parametrize("styles", [1, 2])
+def test_what_is_packed_is_unpacked(styles):
+    small = scene("box", styles)
+    told, voxels = unpack(page_of("box", styles=styles))
+    assert told["styles"][0]["resolution"] == voxels.resolution == 31
+    assert torch.equal(voxels.occupied, small.voxels.occupied)
+    pairs = [(voxels.coarse, small.voxels.coarse), *zip(voxels.styles, small.voxels.styles, strict=True)]
+    for mine, theirs in pairs:
+        assert torch.equal(mine.codes, theirs.codes) and torch.equal(mine.known, theirs.known)
 
 
 def test_the_same_scene_gives_the_same_file():
@@ -81,7 +94,7 @@ def test_the_page_asks_nothing_of_a_network():
 
 def test_titles_and_file_names_are_text_never_markup():
     attack = '</script><script>alert("1")</script>'
-    text = page_of("box", title=attack, names=[attack] * 3).decode()
+    text = page_of("box", title=attack, painting=attack, name=attack, names=[attack] * 3).decode()
     assert attack not in text
     assert unpack(text.encode())[0]["cameras"][0]["name"] == attack
 
@@ -122,8 +135,8 @@ def test_a_browser_shows_what_the_twin_in_torch_says(tab, tmp_path, kind):
 def test_a_camera_that_has_flown_into_a_forward_facing_scene_sees_only_what_is_ahead_of_it(tab, tmp_path):
     small, path = scene("ndc"), tmp_path / "page.html"
     small.cameras = look_ahead((0.0, 0.0, 0.0), (-0.2, 0.1, -2.1))  # past the nearest things
-    small.title, small.names = "Inside", ["0.png", "1.png"]
-    path.write_bytes(build_page(small.voxels, small, small.orbit))
+    small.names = ["0.png", "1.png"]
+    path.write_bytes(build_page(small.voxels, [small], small.orbit))
     tab.open(f"{path.as_uri()}#view=1&size={WIDTH}x{HEIGHT}")
     tab.wait_for(READY)
     expected = picture_of_voxels(small.voxels, small.model, small.cameras[1:])
