@@ -51,7 +51,6 @@ function makeTextures(gl, at, voxels) {
 function describeScene(gl, at) {
   const { space, density } = scene;
   gl.uniform1i(at("u_space"), ["ndc", "box", "contracted"].indexOf(space.kind));
-  gl.uniform1i(at("u_num_steps"), scene.num_steps);
   gl.uniform1i(at("u_unbounded"), space.unbounded);
   gl.uniform3fv(at("u_minimum"), space.minimum);
   gl.uniform3fv(at("u_maximum"), space.maximum);
@@ -65,17 +64,17 @@ function describeScene(gl, at) {
   gl.uniform3fv(at("u_background"), scene.background);
 }
 
-/** A function that draws the scene as a camera sees it, in some look, and returns how many seconds that took. */
+/** A function that draws what a camera sees, in a look, with a share of the steps, and returns the seconds it took. */
 function makeRenderer(gl, voxels) {
   const program = makeProgram(gl);
   gl.useProgram(program);
   const at = (name) => gl.getUniformLocation(program, name);
   makeTextures(gl, at, voxels);
   describeScene(gl, at);
-  const changing = ["u_pose", "u_focal", "u_center", "u_size", "u_strength", "u_density_share", "u_blend", "u_divider"];
+  const changing = ["u_num_steps", "u_pose", "u_focal", "u_center", "u_size", "u_strength", "u_density_share", "u_blend", "u_divider"];
   const places = Object.fromEntries(changing.map((name) => [name, at(name)]));
   const pixel = new Uint8Array(4);
-  return ({ pose, camera }, look, width, height) => {
+  return ({ pose, camera }, look, steps, width, height) => {
     const start = performance.now();
     [canvas.width, canvas.height] = [width, height];
     gl.viewport(0, 0, width, height);
@@ -88,6 +87,7 @@ function makeRenderer(gl, voxels) {
     );
     gl.uniform2f(places.u_size, width, height);
     gl.uniformMatrix4fv(places.u_pose, false, toColumns(pose));
+    gl.uniform1i(places.u_num_steps, Math.round(steps * scene.num_steps));
     gl.uniform1f(places.u_strength, look.strength);
     gl.uniform1f(places.u_density_share, look.strength * look.geometry);
     gl.uniform1f(places.u_blend, look.blend);

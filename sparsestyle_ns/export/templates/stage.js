@@ -2,6 +2,7 @@
 
 const MOVING_SECONDS = 0.04;
 const STILL_SECONDS = 0.5;
+const MOVING_STEPS = 0.5; // of the steps along a ray
 const SETTLE_MILLISECONDS = 200;
 const POSES_PER_SECOND = 10;
 
@@ -25,7 +26,8 @@ class Stage {
   draw(moving) {
     const { scales } = this;
     const scale = moving ? scales.moving : scales.still;
-    const seconds = this.render(cameraOf(this.viewpoint), this.look, ...this.size(scale));
+    const steps = moving && !this.fixed ? MOVING_STEPS : 1;
+    const seconds = this.render(cameraOf(this.viewpoint), this.look, steps, ...this.size(scale));
     const fit = (wanted) => clamp(scale * Math.sqrt(wanted / Math.max(seconds, 1e-4)), [0.1, 1]);
     Object.assign(scales, { moving: fit(MOVING_SECONDS), still: fit(STILL_SECONDS) });
     this.frames++;
@@ -98,7 +100,7 @@ class Stage {
   /** The picture as a PNG, as fine as the screen. */
   async picture() {
     this.pause();
-    this.render(cameraOf(this.viewpoint), this.look, ...this.size(1));
+    this.render(cameraOf(this.viewpoint), this.look, 1, ...this.size(1));
     const png = await new Promise((done) => canvas.toBlob(done, "image/png"));
     this.show(false);
     return png;
