@@ -17,9 +17,9 @@ def is_pinhole(cameras: Cameras) -> bool:
 def pinhole_rays(camera: Cameras) -> Optional[RayBundle]:
     """The rays through all pixels' centres, [H, W]; None for what is no lone pinhole camera (`is_pinhole`).
 
-    nerfstudio's `generate_rays` finds the same origins, unit directions and pixel areas for any mixture of cameras, by
-    masks and three directions a pixel. Here a pixel's area is the solid angle that it covers, d_z³ / (f_x f_y), which
-    nerfstudio's differences of neighbouring directions come close to.
+    nerfstudio's `generate_rays` finds the same origins and unit directions for any mixture of cameras, by masks and
+    three directions a pixel. `pixel_area` is the solid angle of a pixel, cos³ / (f_x f_y) where its ray has that cosine
+    to the camera's axis; nerfstudio's is the product of two lengths that is close to it near the axis.
 
     Example:
         >>> camera = Cameras(torch.eye(4)[None, :3], fx=2.0, fy=2.0, cx=1.0, cy=1.0, width=2, height=2)
