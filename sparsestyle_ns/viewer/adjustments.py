@@ -56,7 +56,7 @@ def keep_outputs(viewer: Viewer, outputs: List[str], choose: Callable[[], None])
 
 
 class ViewerCamera(Cameras):
-    """The camera of a picture in the viewer; its rays are quick to make, and kept, as the depth map needs them again."""
+    """The camera of a picture in the viewer; its rays are quick to make, and kept: its depth map needs them too."""
 
     def generate_rays(self, camera_indices: Any, **settings: Any) -> RayBundle:
         """The rays of all its pixels; nerfstudio's own where there is a crop or the camera is no pinhole."""
