@@ -9,6 +9,7 @@ passed on. A finished stage is not done again, unless it or one before it change
 
 import json
 import math
+import shutil
 import sys
 import time
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from sparsestyle_ns.utils.stages import FINISHED, Stage, StageFailedError, clock
 
 SCRIPTS = Path(__file__).resolve().parent
 COARSE, STYLE = "coarse-fewshot-draft", "hier-style-draft"
-PRODUCTS = ("scene", "style.png", "outputs", "camera_path.json", "stylised.mp4", "index.html")
+PRODUCTS = ("scene", "style.png", "outputs", "camera_path.json", "stylised.mp4", "stylised", "index.html")
 """What the demo writes into its folder."""
 CHECKPOINTS = "outputs/*/{}/*/nerfstudio_models/*.ckpt"
 STAGE_1 = {"seconds": 60.0, "works": {"Stage 1": 0.1}}
@@ -75,6 +76,8 @@ def make_stages(options: Options) -> List[Stage]:
         path.write_text(json.dumps(content, indent=1) + "\n")
         command = ["ns-render", "camera-path", "--load-config", str(run / "config.yml")]
         command += ["--camera-path-filename", str(path), "--rendered-output-names", "rgb", "--output-path", str(film)]
+        film.unlink(missing_ok=True)  # ns-render writes over nothing
+        shutil.rmtree(film.with_suffix(""), ignore_errors=True)
         pictures = [[*command, "--output-format", "images", "--image-format", "png"]] if options.images else []
         return [command, *pictures]
 

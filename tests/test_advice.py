@@ -6,6 +6,7 @@ whether a command gets so far.
 
 import ast
 import functools
+import importlib
 import re
 import shlex
 import shutil
@@ -16,7 +17,7 @@ from typing import Callable, Iterator, NamedTuple, Optional, Tuple, Union
 import pytest
 import torch
 import tyro
-from conftest import TINY, TINY_STYLE, coarse_pipeline
+from conftest import TINY, TINY_STYLE, coarse_pipeline, run_entrypoint
 from test_docs import ROOT, all_flags, nerfstudio_flags, subcommands
 
 from sparsestyle_ns.cli import main
@@ -114,6 +115,8 @@ def typed(command: str, place: SimpleNamespace) -> None:
     program, *words = shlex.split(command.format(**vars(place)))
     if program == "sparsestyle":
         main(words)
+    elif program == "ns-render":
+        run_entrypoint(importlib.import_module("nerfstudio.scripts.render").entrypoint, words)
     else:
         train(*words)
 
@@ -126,6 +129,21 @@ def train(method: str, *words: str) -> None:
     flags = [*small, "--vis", "tensorboard", "--output-dir", str(Path("outputs").resolve()), *words]
     options = (tyro.conf.FlagConversionOff, tyro.conf.ConsolidateSubcommandArgs)
     train.main(tyro.cli(type(config), default=config, args=flags, config=options[:1], prog=method))
+
+
+def views(flags: str) -> str:
+    return f"ns-render dataset --load-config {{coarse}}/config.yml --rendered-output-names {flags}"
+
+
+def flight(flags: str) -> str:
+    command = "ns-render spiral --load-config {coarse}/config.yml --output-format images --output-path a"
+    return f"{command} --downscale-factor 4 --seconds 0.1 {flags}"
+
+
+def into_pictures(name: str, place: SimpleNamespace) -> None:
+    Path("pictures/test/rgb").mkdir(parents=True)
+    Path("pictures/test/rgb/mine.jpg").touch()
+    typed(views(f"rgb --output-path {name}"), place)
 
 
 def photos(place: SimpleNamespace) -> str:
@@ -451,6 +469,11 @@ TABLE = [
     ),
     # Settings of stage 2
     Advice("--pipeline.object-style is ", style("--pipeline.object-style 0"), style("--pipeline.object-style 1")),
+    Advice(
+        "--pipeline.model.object-cells is ",
+        style("--pipeline.model.object-cells 0"),
+        style("--pipeline.model.object-cells 1"),
+    ),
     Advice("--stroke-size is ", style("--stroke-size 3"), style("--stroke-size 2")),
     Advice("name a painting with --style-image FILE", "ns-train hier-style --data {scene} llff-data", style("")),
     Advice("--pipeline.style-features is ", style("--pipeline.style-features 0"), style("--pipeline.style-features 1")),
@@ -625,7 +648,30 @@ TABLE = [
         "sparsestyle export {style} --format splat --max-splats 10 --output-path a.ply",
         None,
     ),
-    # ns-render, in tests/pipelines/test_render_command.py
+    # ns-render; more in tests/pipelines/test_render_command.py
+    Advice("; give a number above 0.", views("rgb --downscale-factor 0"), views("rgb --downscale-factor 1")),
+    Advice(", and leaves less than ", views("rgb --downscale-factor 4"), views("rgb --downscale-factor 2")),
+    Advice(", by which sides are ", flight("--downscale-factor 99"), flight("--downscale-factor 20")),
+    Advice("--frame-rate times --seconds needs", flight("--seconds 0"), flight("--frame-rate 10 --seconds 0.1")),
+    Advice("; choose from ", views("foo"), views("rgb")),
+    Advice("rgba can only be a PNG file", views("rgba"), views("rgba --image-format png")),
+    Advice(
+        "--output-format images, and no other name",
+        flight("--rendered-output-names rgba"),
+        flight("--rendered-output-names rgba --image-format png"),
+    ),
+    Advice(" is a folder; give ", None, None),  # tests/test_ctrl_c.py, as the next
+    Advice("There is no run's config at --load-config ", None, None),
+    Advice(
+        "Something is at --output-path ",
+        lambda place: into_pictures("pictures", place),
+        views("rgb --output-path pictures-2"),
+    ),
+    Advice(
+        " is no name of a film; take ",
+        flight("--output-format video --output-path a.txt"),
+        flight("--output-format video --output-path a.mp4"),
+    ),
     Advice("--interpolation-steps and --frame-rate need 1 or more each", None, None),
     Advice("so the flight is between the training views, as by --pose-source train", None, None),
     Advice("render a path from the viewer with ns-render camera-path", None, None),

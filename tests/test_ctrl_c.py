@@ -1,5 +1,6 @@
 """Ctrl-C, as a real signal to a real process, at any moment of any long command: one sentence, and status 130."""
 
+import json
 import os
 import signal
 import socket
@@ -16,6 +17,13 @@ from interrupted import interrupt
 
 from sparsestyle_ns.utils import interrupts
 
+FLIGHT = {
+    "camera_type": "vr180",
+    "render_height": 8,
+    "render_width": 8,
+    "seconds": 1,
+    "camera_path": [{"camera_to_world": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "fov": 50}] * 4,
+}
 QUIET = ["--vis", "tensorboard", "--viewer.quit-on-train-completion", "True"]
 
 
@@ -85,8 +93,43 @@ def test_in_training_the_iteration_is_finished_and_saved(llff_scene, tmp_path, m
     assert " – next: " in ending.printed.splitlines()[-1]
 
 
+STUDIES = {
+    "tradeoff": " before anything was measured.",
+    **dict.fromkeys(("compare", "ablate"), "; the same command goes on where it was."),
+}
+"""What studies say more than other commands."""
+FRAME = "sparsestyle_ns.models.hier_style:HierStyleModel.get_outputs"
 COMMANDS = {
-    "render": ("ns-render interpolate --pose-source train --output-path {tmp}/a.mp4", "style", "get_outputs"),
+    "a film": ("ns-render interpolate --pose-source train --output-path {tmp}/a/b.mp4", "style", FRAME, 5),
+    "films of two eyes": (
+        "ns-render camera-path --camera-path-filename {path} --output-path {tmp}/a.mp4",
+        "coarse",
+        "sparsestyle_ns.models.coarse_fewshot:CoarseFewShotModel.get_outputs",
+        6,
+    ),
+    "pictures of a film": (
+        "ns-render interpolate --pose-source train --output-format images --output-path {tmp}/a",
+        "style",
+        FRAME,
+        5,
+    ),
+    "pictures of views": ("ns-render dataset --split train --output-path {tmp}/a", "style", FRAME, 2),
+    "cloud": ("ns-export pointcloud --output-dir {tmp} --normal-method open3d --num-points 100000", "style", FRAME, 3),
+    "tradeoff": (
+        "sparsestyle tradeoff --data {scene} --output-dir {tmp}/a",
+        "coarse",
+        "sparsestyle_ns.studies.workbench:Workbench.start",
+    ),
+    "compare": (
+        "sparsestyle compare --data {scene} --style-images {painting} --output-path {tmp}/a.html --output-dir {tmp}/o",
+        "coarse",
+        "sparsestyle_ns.studies.run_queue:RunQueue._train",
+    ),
+    "ablate": (
+        "sparsestyle ablate --data {scene} --style-images {painting} --output-path {tmp}/a.html --output-dir {tmp}/o",
+        "coarse",
+        "sparsestyle_ns.studies.run_queue:RunQueue._train",
+    ),
     "eval": ("ns-eval --output-path {tmp}/a.json", "style", "sparsestyle_ns.evaluation.held_out:exact_outputs"),
     "evaluate": ("sparsestyle evaluate {run}", "style", "sparsestyle_ns.evaluation.held_out:exact_outputs"),
     "gallery": (
@@ -114,18 +157,19 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("case", slow(COMMANDS))
-def test_other_commands_make_nothing(runs, llff_scene, tmp_path, case):
-    words, kind, moment = case
-    run = getattr(runs, kind)
-    command = words.format(run=run, scene=llff_scene, tmp=tmp_path / "made").split()
+def test_other_commands_make_nothing(runs, llff_scene, painting, tmp_path, case):
+    words, kind, moment, *call = case
+    run, path = getattr(runs, kind), tmp_path / "path.json"
+    path.write_text(json.dumps(FLIGHT))
+    places = {"scene": llff_scene, "painting": painting, "path": path, "tmp": tmp_path / "made"}
+    command = words.format(run=run, **places).split()
     if command[0].startswith("ns-"):
         command += ["--load-config", str(run / "config.yml")]
-    if moment == "get_outputs":
-        moment = "sparsestyle_ns.models.hier_style:HierStyleModel.get_outputs"
     before = {path for path in runs.outputs.rglob("*")}
     (tmp_path / "made").mkdir()
-    interrupt(command, moment, tmp_path / "log", presses=2).assert_told()
-    assert not list((tmp_path / "made").iterdir()) or command[0] == "ns-render"  # nerfstudio ends its film
+    sentence = "Stopped by Ctrl-C" + STUDIES.get(command[1], ".")
+    interrupt(command, moment, tmp_path / "log", 2, *call).assert_told(sentence)
+    assert not list((tmp_path / "made").iterdir())
     assert {path for path in runs.outputs.rglob("*")} == before
 
 
@@ -221,3 +265,28 @@ def test_other_methods_keep_nerfstudios_ways(monkeypatch, tmp_path, words, is_gu
     )
     interrupts.guard_nerfstudio(("coarse-fewshot", "hier-style"))
     assert bool(guarded) is is_guarded
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("ns-render interpolate --load-config {run}", r"is a folder; give .*/hier-style/a/config\.yml\."),
+        ("ns-viewer --load-config {run}/confg.yml", "There is no run's config at"),
+        ("ns-eval --load-config={run}b/config.yml", "There is no run's config at"),
+        ("ns-eval --load-config {run}/config.yml", None),
+        ("ns-eval --load-config elsewhere/nerfacto/a", None),
+        ("ns-eval", None),
+    ],
+)
+def test_a_run_that_is_not_there_is_said_where_it_would_be_one_of_these_methods(monkeypatch, tmp_path, words, sentence):
+    run = tmp_path / "hier-style" / "a"
+    run.mkdir(parents=True)
+    (run / "config.yml").write_text("method_name: hier-style\n")
+    monkeypatch.setattr(interrupts, "end_on_ctrl_c", lambda: None)
+    monkeypatch.chdir("/")
+    monkeypatch.setattr(sys, "argv", words.format(run=run).split())
+    if sentence is None:
+        interrupts.guard_nerfstudio(("coarse-fewshot", "hier-style"))
+        return
+    with pytest.raises(SystemExit, match=sentence):
+        interrupts.guard_nerfstudio(("coarse-fewshot", "hier-style"))

@@ -143,3 +143,61 @@ def test_impossible_option_is_refused(capsys):
         demo.main(["--frames", "0"])
     assert ended.value.code == 2
     assert "--frames is 0, but has to be at least 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", demo.PRODUCTS)
+def test_a_folder_with_files_of_ones_own_is_refused_and_stays(tmp_path, capsys, name):
+    (tmp_path / name).mkdir() if "." not in name else (tmp_path / name).write_text("mine")
+    assert demo.main(["--output", str(tmp_path)]) == 1
+    assert f"has a {name} that isn't the demo's; name a new folder with --output." in capsys.readouterr().err
+    assert [path.name for path in tmp_path.rglob("*")] == [name]
+
+
+def test_other_files_may_lie_in_the_demos_folder(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    demo.claim_folder(tmp_path)
+    (tmp_path / "style.png").touch()
+    demo.claim_folder(tmp_path)  # which is the demo's own by now
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_a_file_in_place_of_the_folder_is_said(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert demo.main(["--output", str(tmp_path / "file")]) == 1
+    assert "can't be used" in capsys.readouterr().err
+
+
+def test_the_film_of_an_earlier_demo_makes_room(tmp_path, monkeypatch):
+    (tmp_path / "outputs" / "llff" / "hier-style-draft" / "a").mkdir(parents=True)
+    (tmp_path / "outputs" / "llff" / "hier-style-draft" / "a" / "config.yml").touch()
+    for name in ("stylised.mp4", "stylised/00000.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    monkeypatch.setattr(demo, "flight", lambda *_: {})
+    film, pictures = demo.make_stages(demo.Options(output=tmp_path, images=True))[4].commands()
+    assert not (tmp_path / "stylised.mp4").exists() and not (tmp_path / "stylised").exists()
+    assert film[film.index("--output-path") + 1] == pictures[pictures.index("--output-path") + 1]
+
+
+def test_after_ctrl_c_the_same_command_goes_on_with_the_stage_under_way(tmp_path, monkeypatch, capsys):
+    from sparsestyle_ns.utils import stages
+
+    begun = []
+
+    def run(command, heading, *_):
+        begun.append(heading)
+        if heading.startswith("Painting") and begun.count(heading) == 1:
+            raise KeyboardInterrupt
+        for product in ("scene/llff/a", "style.png"):
+            (tmp_path / product).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / product).touch()
+
+    monkeypatch.setattr(stages, "run_command", run)
+    every_stage = demo.make_stages
+    monkeypatch.setattr(demo, "make_stages", lambda options: every_stage(options)[:2])
+    monkeypatch.setattr(demo, "newest_run", lambda *_: tmp_path)
+    command = ["--output", str(tmp_path)]
+    assert demo.main(command) == 130
+    assert "the same command goes on with the stage that was under way." in capsys.readouterr().err
+    assert demo.main(command) == 0
+    assert [heading.split()[0] for heading in begun] == ["Photographing", "Painting", "Painting"]

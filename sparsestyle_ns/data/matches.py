@@ -2,7 +2,9 @@
 
 Where a scene keeps the tracks that its cameras were estimated from, the points are those.
 
-A match of two features counts where it obeys the epipolar geometry of the two known cameras within a pixel. Colours are
+A match of two features counts where it obeys the epipolar geometry of the two known cameras within a pixel. Where two
+photos have enough of them, features are then held against those alone that they may be by that geometry: with so few to
+choose from, twice as many stand out. Colours are
 those of blurred photos, so that a match that is off by a fraction of a pixel doesn't count as a difference.
 """
 
@@ -12,15 +14,18 @@ from typing import List, Optional, Sequence
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from nerfstudio.cameras.camera_utils import radial_and_tangential_undistort
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from sparsestyle_ns.data.features import Pair, find_features, linked_groups, match_photos
+from sparsestyle_ns.data.features import Pair, find_features, linked_groups, match_photos, mutual_matches
 from sparsestyle_ns.data.tracks import Tracks
 
 MAX_EPIPOLAR_ERROR = 1.0
 """Sampson distance, in pixels, up to which a match obeys the cameras."""
+MIN_LINKING = 20
+"""Matches among all features by which two photos show the same thing, and others may be looked for along its lines. In
+photos of one thing from afar, of repeated texture above all, most of what is found along lines is chance."""
 BLUR = 2.0
 """Standard deviation, in pixels, of the blur under which colours are taken."""
 LENSES = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
@@ -92,10 +97,8 @@ def match_points(
     """
     poses = cameras.camera_to_worlds.double().numpy()
     pairs = _neighbouring_pairs(poses)
-    if tracks is None:
-        found = match_photos([find_features(_grey(photo)) for photo in photos], pairs)
-    else:
-        found = tracks.matches(names, [photo.shape[1::-1] for photo in photos])
+    features = [find_features(_grey(photo)) for photo in photos] if tracks is None else []
+    found = tracks.matches(names, [photo.shape[1::-1] for photo in photos]) if tracks else match_photos(features, pairs)
     seen = [
         _look_at(photo, points, cameras, index)
         for index, (photo, points) in enumerate(zip(photos, found.points, strict=True))
@@ -105,10 +108,16 @@ def match_points(
         both = [seen[index] for index in pair]
         if None in both:
             continue
-        matched = list(zip(both, found.pairs[pair], strict=True))
+        rows, between = found.pairs[pair], poses[list(pair)]
+        most = MAX_EPIPOLAR_ERROR * max(view.pixel for view in both)
+        error = epipolar_error(*(view.rays[row] for view, row in zip(both, rows, strict=True)), *between)
+        rows = rows[:, error < most]
+        if features and rows.shape[1] >= MIN_LINKING:
+            allowed = near_epipolar_lines(*(view.rays for view in both), *between, most)
+            rows = np.stack(mutual_matches(*(features[index].descriptors for index in pair), allowed=allowed))
+        matched = list(zip(both, rows, strict=True))
         rgba = np.stack([view.rgba[row] for view, row in matched])
-        error = epipolar_error(*(view.rays[row] for view, row in matched), *poses[list(pair)])
-        good = (error < MAX_EPIPOLAR_ERROR * max(view.pixel for view in both)) & (rgba[..., 3] > 0.99).all(axis=0)
+        good = (rgba[..., 3] > 0.99).all(axis=0)
         views.append(np.repeat(np.array(pair)[:, None], good.sum(), axis=1))
         colors.append(rgba[:, good, :3])
         directions.append(np.stack([view.directions[row[good]] for view, row in matched]))
@@ -191,9 +200,7 @@ def epipolar_error(
 ) -> Float[np.ndarray, "matches"]:
     """Sampson's distance of matches from the epipolar geometry of two camera-to-world poses, in focal lengths (Hartley
     and Zisserman, Multiple View Geometry, Eq. 11.9; a fisheye's gradient is over its own image points)."""
-    rotation = pose_second[:, :3].T @ pose_first[:, :3]
-    x, y, z = pose_second[:, :3].T @ (pose_first[:, 3] - pose_second[:, 3])
-    essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation
+    essential = _essential_matrix(pose_first, pose_second)
     line_second, line_first = first.directions @ essential.T, second.directions @ essential
     algebraic = (second.directions * line_second).sum(axis=-1)
     gradient = sum(
@@ -201,6 +208,32 @@ def epipolar_error(
         for rays, line in ((second, line_second), (first, line_first))
     )
     return np.abs(algebraic) / np.sqrt(np.maximum(gradient, 1e-24))
+
+
+def near_epipolar_lines(
+    first: PixelRays,
+    second: PixelRays,
+    pose_first: Float[np.ndarray, "3 4"],
+    pose_second: Float[np.ndarray, "3 4"],
+    max_error: float,
+) -> Bool[np.ndarray, "features others"]:
+    """Which of one camera's points may be which of another's: those with an `epipolar_error` below `max_error`."""
+    essential = _essential_matrix(pose_first, pose_second)
+    line_second, line_first = first.directions @ essential.T, second.directions @ essential
+    gradient = sum(
+        (first.tangents[..., axis] @ line_first.T) ** 2 + (line_second @ second.tangents[..., axis].T) ** 2
+        for axis in range(2)
+    )
+    return (line_second @ second.directions.T) ** 2 < max_error**2 * np.maximum(gradient, 1e-24)
+
+
+def _essential_matrix(
+    pose_first: Float[np.ndarray, "3 4"], pose_second: Float[np.ndarray, "3 4"]
+) -> Float[np.ndarray, "3 3"]:
+    """Takes a direction of the first of two camera-to-world poses to the normal of its epipolar plane in the second."""
+    rotation = pose_second[:, :3].T @ pose_first[:, :3]
+    x, y, z = pose_second[:, :3].T @ (pose_first[:, 3] - pose_second[:, 3])
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation
 
 
 def sample(image: Float[np.ndarray, "H W C"], points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points C"]:

@@ -5,12 +5,13 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Optional
+from typing import Any, Dict, Optional
 
 import tyro
 import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
+from sparsestyle_ns.pipelines.render_command import begin_render
 from sparsestyle_ns.runs.checkpoints import checkpoint_path, checkpoint_step, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import read_config
 from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord
@@ -28,6 +29,11 @@ class RunConfig(TrainerConfig):
 
     run_folder: tyro.conf.Suppress[Optional[Path]] = None
     """Where a run that was opened lies, whatever its config.yml says; not in that file."""
+
+    def __setstate__(self, state: Dict[str, Any]) -> None:
+        """Called when a config.yml is read, which nerfstudio's commands do first of all."""
+        vars(self).update(state)
+        begin_render()
 
     def get_base_dir(self) -> Path:
         """The run's folder."""

@@ -62,6 +62,8 @@ class FineFieldConfig:
     max_resolution: int = 256
     """Cells along the cube's side on the last level (N_max). The paper's is 512; in cells as fine as pixels
     new views see grain."""
+    object_cells: float = 2.0
+    """How many times as many cells the last level has for an object on a background, which fills a part of the cube."""
     features_per_level: int = 4
     """Features of a cell's corner."""
     log2_table_size: int = 19
@@ -79,18 +81,26 @@ class FineFieldConfig:
             is_there = has_tiny_cuda_nn(device, self.features_per_level)
             self.fine_encoding = "tiny-cuda-nn" if is_there else "hash"
 
-    def new_field(self, coarse: CoarseField, with_density: bool, device: torch.device) -> StylisedField:
-        """A field as it is before training, to be used on `device`; a copy of `coarse` starts from its weights."""
+    def new_field(
+        self, coarse: CoarseField, with_density: bool, is_object: bool, device: torch.device
+    ) -> StylisedField:
+        """A field as it is before training, to be used on `device`; a copy of `coarse` starts from its weights.
+
+        Args:
+            with_density: whether it has a residual density.
+            is_object: whether the scene is an object on a background.
+        """
         if self.stylised_field == "coarse":
             return FineTunedField(copy.deepcopy(coarse).requires_grad_(True))
         sizes = coarse.feature_dim, self.hidden_layers, self.layer_width
-        return ResidualField(self._encoding(device), *sizes, self.residual_density_scale, with_density)
+        return ResidualField(self._encoding(is_object, device), *sizes, self.residual_density_scale, with_density)
 
-    def _encoding(self, device: torch.device) -> PointEncoding:
+    def _encoding(self, is_object: bool, device: torch.device) -> PointEncoding:
         if self.fine_encoding == "none":
             return NoEncoding()
         if self.fine_encoding == "frequency":
             return FrequencyEncoding(self.frequency_levels)
-        resolutions = self.min_resolution, self.max_resolution
+        times = self.object_cells if is_object else 1.0
+        resolutions = self.min_resolution, round(times * self.max_resolution)
         shape = (self.hash_levels, *resolutions, self.features_per_level, self.log2_table_size)
         return TinyCudaGrid(*shape, device=device) if self.fine_encoding == "tiny-cuda-nn" else HashGrid(*shape)

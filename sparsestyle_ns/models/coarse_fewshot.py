@@ -82,6 +82,7 @@ class CoarseFewShotModel(SceneModel):
     """The coarse field, trained on the reconstruction loss (Eq. 4) with regularisers that make it a surface."""
 
     config: CoarseFewShotModelConfig
+    picture_names = ("rgb", "accumulation", "depth")
 
     def populate_modules(self) -> None:
         """Builds the field, and the grid that guides samples."""

@@ -1,7 +1,7 @@
 """What the models of both stages have in common: they are built for what was decided about a scene."""
 
 from dataclasses import dataclass, field
-from typing import Any, Dict, NamedTuple, Optional
+from typing import Any, Dict, NamedTuple, Optional, Tuple
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
@@ -53,6 +53,9 @@ class SceneModel(Model):
     `scene_box` is in NDC where there is `ndc`, the dataparser's map to it, else in the world; among `kwargs` are the
     `device` that the model will be moved to and, where cameras are refined, the `refinement`.
     """
+
+    picture_names: Tuple[str, ...]
+    """Of a picture's outputs."""
 
     def __init__(
         self,

@@ -14,8 +14,10 @@ from typing import Any, Dict, List, Optional
 import numpy as np
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
+from sparsestyle_ns.data.photos import SMALLEST_SIDE
 from sparsestyle_ns.pipelines.nerfstudio_options import render_options
-from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.pipelines.render_files import claim_output, render_whole
+from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.interrupts import take_away_at_end
 from sparsestyle_ns.utils.progress import say
 
@@ -24,6 +26,8 @@ AROUND = ("equirectangular", "omnidirectional", "vr180")
 KINDS = ("perspective", "fisheye", *AROUND)
 LONGEST_SIDE = 16384
 """Pixels, that no film has."""
+FRAME_RATES = 0.01, 1000.0
+"""Frames a second that films can have."""
 EXPORT_AGAIN = "export it again from the viewer's Render tab"
 
 
@@ -38,6 +42,34 @@ def running_command() -> Optional[Any]:
     return None
 
 
+@exit_on_input_error
+def begin_render() -> None:
+    """Called when a config.yml has been read: where ns-render is what runs, checks it, and sees to what it writes."""
+    command = running_command()
+    if command is not None:
+        check_numbers(command)
+        claim_output(command)
+        render_whole(command)
+
+
+def check_numbers(command: Any) -> None:
+    """InputError for numbers that nerfstudio stumbles over.
+
+    A scene's pictures are reduced by `prepare_render` where ns-render would have its parser do so, which not all can.
+    """
+    factor = command.downscale_factor
+    if factor is not None and not 0 < factor < math.inf:
+        raise InputError(f"--downscale-factor is {factor}; give a number above 0.")
+    if command.eval_num_rays_per_chunk is not None and command.eval_num_rays_per_chunk < 1:  # 0 would be the default
+        raise InputError(f"--eval-num-rays-per-chunk is {command.eval_num_rays_per_chunk}; give 1 or more.")
+    if hasattr(command, "radius"):
+        frames = command.frame_rate * command.seconds
+        if not (command.frame_rate > 0 and 1 <= frames < math.inf and math.isfinite(command.radius)):
+            raise InputError("--frame-rate times --seconds needs to be 1 frame or more, and --radius to be finite.")
+    if hasattr(command, "split") and factor is not None:
+        command.picture_scale, command.downscale_factor = 1.0 / factor, None
+
+
 def prepare_render(pipeline: VanillaPipeline) -> None:
     """Checks what ns-render was asked for, if it is what runs, before a checkpoint is loaded; an InputError refuses."""
     command = running_command()
@@ -45,13 +77,64 @@ def prepare_render(pipeline: VanillaPipeline) -> None:
         return
     for line in render_options(command):
         say(line)
+    _check_names(pipeline, command)
+    reduce_pictures(pipeline, getattr(command, "picture_scale", 1.0))
     if hasattr(command, "camera_path_filename"):
         content = read_camera_path(Path(command.camera_path_filename).expanduser())
         command.camera_path_filename = _saved(content)
+        _check_size(command, [content["render_width"], content["render_height"]])
         if str(content.get("camera_type", "")).lower() in AROUND and pipeline.model.ndc is not None:
             say("The scene is forward-facing: what a camera sees beside and behind the photos' views is empty.")
     if hasattr(command, "pose_source"):
         find_ends(pipeline, command)
+    if hasattr(command, "radius"):  # nerfstudio multiplies them by poses, which are of single precision
+        cameras = pipeline.datamanager.eval_dataloader.cameras
+        cameras.fx, cameras.fy = cameras.fx.float(), cameras.fy.float()
+    if hasattr(command, "pose_source") or hasattr(command, "radius"):
+        is_train = getattr(command, "pose_source", "eval") == "train"
+        cameras = (pipeline.datamanager.train_dataset if is_train else pipeline.datamanager.eval_dataset).cameras
+        _check_size(command, [*cameras.width.flatten().tolist(), *cameras.height.flatten().tolist()])
+
+
+def _check_names(pipeline: VanillaPipeline, command: Any) -> None:
+    """InputError where a picture is asked for that isn't rendered, or can't be saved."""
+    names, known = command.rendered_output_names, list(pipeline.model.picture_names)
+    is_dataset = hasattr(command, "split")
+    if is_dataset:
+        known += ["gt-rgb"] + ["gt-mask"] * (pipeline.datamanager.train_dataparser_outputs.mask_filenames is not None)
+        known += [f"raw-{name}" for name in known]
+    unknown = [] if names is None else [name for name in names if name not in [*known, "rgba"]]
+    if unknown or names == []:
+        what = "names nothing" if names == [] else f"names {unknown[0]}, which isn't rendered"
+        raise InputError(f"--rendered-output-names {what}; choose from {', '.join([*known, 'rgba'])}.")
+    is_png = getattr(command, "output_format", "images") == "images" and command.image_format == "png"
+    if "rgba" in (names or []) and not (is_png and (is_dataset or names == ["rgba"])):
+        raise InputError(
+            "Of --rendered-output-names, rgba can only be a PNG file of its own; render it with --image-format png"
+            + ("." if is_dataset else ", --output-format images, and no other name.")
+        )
+
+
+def reduce_pictures(pipeline: VanillaPipeline, scale: float) -> None:
+    """Has `ns-render dataset` take a scene's photos, and render its views, at a share of the size of the run's."""
+    config, cameras = pipeline.config.datamanager, pipeline.datamanager.train_dataset.cameras
+    if scale * min(int(cameras.width.min()), int(cameras.height.min())) < SMALLEST_SIDE:
+        raise InputError(
+            f"--downscale-factor is {1 / scale:g}, and leaves less than {SMALLEST_SIDE} pixels; give less."
+        )
+    config.camera_res_scale_factor *= scale
+    if config.max_image_side is not None:
+        config.max_image_side = math.ceil(config.max_image_side * scale)
+
+
+def _check_size(command: Any, sides: List[int]) -> None:
+    """InputError where a film's frames, which have these sides before they are reduced, would be too small or large."""
+    least, most = min(sides) / command.downscale_factor, max(sides) / command.downscale_factor
+    if least < 1 or most > LONGEST_SIDE:
+        raise InputError(
+            f"--downscale-factor is {command.downscale_factor:g}, by which sides are {least:.3g} to {most:.6g} pixels; "
+            f"give one that leaves 1 to {LONGEST_SIDE}."
+        )
 
 
 def _saved(content: Dict[str, Any]) -> Path:
@@ -98,6 +181,11 @@ def read_camera_path(path: Path) -> Dict[str, Any]:
         raise InputError(f"{path} has no cameras in camera_path: add keyframes in the viewer, and {EXPORT_AGAIN}.")
     if not _number(content.get("seconds")) > 0:
         raise InputError(f"{path} doesn't say in seconds, a number above 0, how long the film is: add it.")
+    if not FRAME_RATES[0] <= len(keyframes) / content["seconds"] <= FRAME_RATES[1]:
+        raise InputError(
+            f"{path} shows {len(keyframes)} frames in {content['seconds']:g} seconds, and a film has from "
+            f"{FRAME_RATES[0]:g} to {FRAME_RATES[1]:g} a second: correct seconds."
+        )
     for side in ("render_height", "render_width"):
         value = content.get(side)
         # nerfstudio's viewer may write 1080.0, which is whole.

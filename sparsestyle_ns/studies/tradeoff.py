@@ -1,5 +1,6 @@
 """`sparsestyle tradeoff`: measures all curves within a budget and writes the report, also when it is stopped."""
 
+import contextlib
 import gc
 import tempfile
 import warnings
@@ -39,7 +40,11 @@ def tradeoff(options: TradeoffOptions) -> None:
     study, options = study_of(options), replace(options, output_dir=report_folder(options.output_dir, options.force))
     try:
         report = measure(study, options, Budget(budget_seconds))
+        if STOPPED in report.left_out and not report.measured:
+            raise StoppedByCtrlC
     except PRESSES:
+        with contextlib.suppress(OSError):  # it wasn't made yet, or has other files
+            options.output_dir.rmdir()
         stop("Stopped by Ctrl-C before anything was measured.")
     page = report.write(options.output_dir)
     lines = report.recommendation or ["Nothing could be measured in the time there was; give a larger --budget."]

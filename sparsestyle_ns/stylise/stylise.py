@@ -13,6 +13,7 @@ from sparsestyle_ns.data.parser_choice import parser_name
 from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD, read_config
+from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.stylise.stylise_options import StyliseOptions
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import digest, safe_file_name
@@ -31,12 +32,14 @@ def stylise(options: StyliseOptions) -> None:
     """Runs what isn't finished yet, by checked options, and says where to look.
 
     Raises:
-        InputError: a command failed, and said why; or the folder has pages that aren't this command's.
+        InputError: a command failed, and said why; the folder has pages that aren't this command's; or the painting
+            can't be used.
         SystemExit: status 130, after Ctrl-C.
     """
     taken = [page for page in PAGES if (options.output / page).exists()]
     if taken and not (options.output / FINISHED).is_dir():
         raise InputError(f"{options.output} has a {taken[0]} that this command didn't make; name another --output.")
+    Painting.read(options.painting)  # which stage 2 would do minutes later
     again = shlex.join(["sparsestyle", *sys.argv[1:]])
     try:
         durations = run_stages(options.output, make_stages(options))

@@ -87,7 +87,17 @@ def prepare_output(output_path: Path, what: str, example: str, force: bool = Fal
         with tempfile.TemporaryFile(dir=output_path.parent):
             pass
     except OSError as error:
-        raise _not_writable(output_path, what, error) from error
+        raise not_writable(output_path, what, error.strerror) from error
+
+
+def check_writable(path: Path, what: str) -> None:
+    """An `InputError`, as of `prepare_output`, where a file or a folder can't be made; nothing is left of the trial."""
+    around = next(folder for folder in path.absolute().parents if folder.exists())
+    try:
+        with tempfile.TemporaryFile(dir=around):
+            pass
+    except OSError as error:
+        raise not_writable(path, what, error.strerror) from error
 
 
 def write_output(output_path: Path, content: Union[str, bytes], what: str, example: str) -> Path:
@@ -99,13 +109,12 @@ def write_output(output_path: Path, content: Union[str, bytes], what: str, examp
     try:
         return write_whole(output_path, content).resolve()
     except OSError as error:
-        raise _not_writable(output_path, what, error) from error
+        raise not_writable(output_path, what, error.strerror) from error
 
 
-def _not_writable(output_path: Path, what: str, error: OSError) -> InputError:
-    return InputError(
-        f"{what} can't be written to {output_path} ({error.strerror}); name another file with --output-path."
-    )
+def not_writable(output_path: Path, what: str, reason: Optional[str]) -> InputError:
+    """An error that says why a command can't write a file."""
+    return InputError(f"{what} can't be written to {output_path} ({reason}); name another file with --output-path.")
 
 
 def free_name(name: str, taken: Iterable[str]) -> str:

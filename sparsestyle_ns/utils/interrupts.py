@@ -66,6 +66,23 @@ def ended_by_ctrl_c() -> Iterator[None]:
         stop(SENTENCE)
 
 
+@contextmanager
+def ending_on(*signals: signal.Signals) -> Iterator[None]:
+    """Signals that would end this process at once end it so that its command ends, too."""
+    before = {number: signal.signal(number, lambda number, _: sys.exit(128 + number)) for number in signals}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def stop_if_pressed() -> None:
+    """Ends the process if Ctrl-C was pressed before, whatever went wrong after that."""
+    if _pressed_at is not None:
+        raise StoppedByCtrlC
+
+
 def take_away_at_end(leftover: Callable[[], object]) -> None:
     """Calls a function at the end of the process, also where a second Ctrl-C ends it at once."""
     _leftovers.append(leftover)
@@ -75,9 +92,21 @@ def take_away_at_end(leftover: Callable[[], object]) -> None:
 def guard_nerfstudio(methods: Tuple[str, ...]) -> None:
     """Guards this process if it is a command of nerfstudio's on a method, or a run, whose name starts with these."""
     command = ns_command()
+    if command is not None:
+        _refuse_missing_run(methods)
     is_asked_for = command == "train" and any(word.startswith(methods) for word in sys.argv[1:])
     if is_asked_for or (command is not None and _run_is_of(methods)):
         end_on_ctrl_c()
+
+
+def _refuse_missing_run(methods: Tuple[str, ...]) -> None:
+    """Ends the process with a sentence where --load-config names no file, but what would be a run of such a method."""
+    path = Path(ns_option("load-config") or "").expanduser()
+    if path.is_file() or not any(part.startswith(methods) for part in path.absolute().parts):
+        return
+    if (path / "config.yml").is_file():
+        raise SystemExit(f"Error: --load-config {path} is a folder; give {path / 'config.yml'}.")
+    raise SystemExit(f"Error: There is no run's config at --load-config {path}; give a run's config.yml.")
 
 
 def ns_command() -> Optional[str]:

@@ -9,13 +9,12 @@ import sys
 import threading
 import time
 from collections import deque
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Callable, Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
 from sparsestyle_ns.utils.files import write_whole
-from sparsestyle_ns.utils.interrupts import PRESSES
+from sparsestyle_ns.utils.interrupts import PRESSES, ending_on
 from sparsestyle_ns.utils.progress import PROGRESS_FILE, Bar, ProgressReport, bar, is_progress_line, say
 
 LINES_OF_A_FAILURE = 20
@@ -93,19 +92,8 @@ def run_stages(folder: Path, stages: Sequence[Stage], force: bool = False) -> Li
         KeyboardInterrupt: Ctrl-C; the command that was under way had the time to save what it had.
         SystemExit: SIGTERM or SIGHUP, which end that command too.
     """
-    with _ending_on(signal.SIGTERM, signal.SIGHUP):
+    with ending_on(signal.SIGTERM, signal.SIGHUP):
         return _run_all(folder, stages, force)
-
-
-@contextmanager
-def _ending_on(*signals: signal.Signals) -> Iterator[None]:
-    """Signals that would end this process at once end it so that its command ends, too."""
-    before = {number: signal.signal(number, lambda number, _: sys.exit(128 + number)) for number in signals}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _run_all(folder: Path, stages: Sequence[Stage], force: bool) -> List[Tuple[str, Optional[float]]]:

@@ -1,5 +1,6 @@
 """What ns-render would stumble over is said before it does: camera paths, one held-out view, options without effect."""
 
+import contextlib
 import copy
 import json
 from dataclasses import fields
@@ -7,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import TINY, ns_train, only_run, run_entrypoint
 from hypothesis import given
 from hypothesis import strategies as st
 from nerfstudio.cameras.camera_paths import get_path_from_json
@@ -14,9 +16,11 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConf
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.models.base_model import ModelConfig
 from nerfstudio.scripts import render
+from PIL import Image
 
 from sparsestyle_ns.pipelines import nerfstudio_options as options
 from sparsestyle_ns.pipelines.render_command import find_ends, read_camera_path
+from sparsestyle_ns.pipelines.render_files import all_or_nothing, claim_output
 from sparsestyle_ns.utils.errors import InputError
 
 CAMERA = {"camera_to_world": np.eye(4).flatten().tolist(), "fov": 50, "aspect": 1}
@@ -107,6 +111,8 @@ def test_any_json_is_refused(tmp_path, content):
         ({"seconds": None}, "doesn't say in seconds, a number above 0, how long the film is"),
         ({"camera_type": "orthographic"}, 'has the camera_type "orthographic": name one of perspective, fisheye'),
         ({"render_width": 0}, "has no render_width from 1"),
+        ({"seconds": 1e-9}, "shows 2 frames in 1e-09 seconds, and a film has from 0.01 to 1000 a second"),
+        ({"seconds": 1e6}, "a second: correct seconds."),
         ({"crop": {"crop_center": [0, 0, 0]}}, "has no crop_scale of three numbers"),
     ],
 )
@@ -163,3 +169,81 @@ def test_an_option_without_effect_is_named_where_it_is_given():
     assert "--load-3D-points" in line
     command = render.SpiralRender(load_config=None, camera_idx=3)
     assert "--camera-idx has no effect" in options.render_options(command)[0]
+
+
+def rendering(**settings):
+    command = render.RenderInterpolated(load_config=None, **settings)
+    claim_output(command)
+    return str(command.output_path)
+
+
+def test_a_film_never_takes_the_place_of_another(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert rendering() == "renders/output.mp4"
+    (tmp_path / "renders" / "output").mkdir(parents=True)
+    (tmp_path / "renders" / "output.mp4").touch()
+    assert rendering() == "renders/output-2.mp4"
+    assert rendering(output_format="images") == "renders/output.mp4"  # an empty folder, of the name without suffix
+    (tmp_path / "renders" / "output" / "00000.jpg").touch()
+    assert rendering(output_format="images") == "renders/output-2.mp4"
+    assert rendering(output_path=tmp_path / "film") == str(tmp_path / "film.mp4")
+    (tmp_path / "film.mp4").mkdir()
+    with pytest.raises(InputError, match=r"Something is at --output-path .*film already; take .*film-2\.mp4 or"):
+        rendering(output_path=tmp_path / "film")
+    with pytest.raises(InputError, match=r"can't be written to .*output\.mp4/a\.mp4 \(Not a directory\)"):
+        rendering(output_path=tmp_path / "renders" / "output.mp4" / "a.mp4")
+
+
+def test_pictures_of_views_never_mix_with_those_of_another_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "renders" / "test" / "rgb").mkdir(parents=True)
+    (tmp_path / "renders" / "test" / "rgb" / "a.jpg").touch()
+    for settings, expected in (
+        ({}, "renders-2"),
+        ({"split": "train+test"}, "renders-2"),
+        ({"split": "train"}, "renders"),
+        ({"rendered_output_names": ["rgb"]}, "renders-2"),
+        ({"rendered_output_names": ["depth"]}, "renders"),
+    ):
+        command = render.DatasetRender(load_config=None, **settings)
+        claim_output(command)
+        assert str(command.output_path) == expected
+
+
+def test_a_folder_of_ones_own_isnt_taken_for_a_films_own(tmp_path):
+    (tmp_path / "film_temp").mkdir()  # which nerfstudio would fill and then delete, for films of two eyes' views
+    (tmp_path / "film_temp" / "mine").touch()
+    command = render.RenderCameraPath(load_config=None, output_path=tmp_path / "film.mp4")
+    with pytest.raises(InputError, match="Something is at"):
+        claim_output(command)
+
+
+@pytest.mark.parametrize("ends_well", [True, False])
+def test_what_is_made_stays_only_if_all_of_it_is_made(tmp_path, ends_well):
+    film, pictures = tmp_path / "new" / "film.mp4", tmp_path / "pictures"
+    pictures.mkdir()
+    with contextlib.suppress(RuntimeError), all_or_nothing([film, pictures]):
+        film.parent.mkdir()
+        film.touch()
+        (pictures / "deep").mkdir()
+        (pictures / "deep" / "a.png").touch()
+        if not ends_well:
+            raise RuntimeError
+    left = {path.name for path in tmp_path.rglob("*")}
+    assert left == ({"new", "film.mp4", "pictures", "deep", "a.png"} if ends_well else {"pictures"})
+
+
+@pytest.mark.parametrize("parser", ["llff-data", "blender-data"])
+def test_views_of_any_scene_are_rendered_at_a_share_of_their_size(llff_scene, tmp_path, parser):
+    import make_sample_scene
+
+    scene = llff_scene
+    if parser == "blender-data":
+        make_sample_scene.main([str(tmp_path), "--layout", "blender", "--width", "32", "--num-views", "8"])
+        scene = tmp_path / "blender"
+    ns_train("coarse-fewshot", scene, tmp_path / "outputs", "--max-num-iterations", "1", *TINY, parser=parser)
+    config = only_run(tmp_path / "outputs", "coarse-fewshot") / "config.yml"
+    flags = ["--load-config", config, "--rendered-output-names", "rgb", "gt-rgb", "--downscale-factor", "2"]
+    run_entrypoint(render.entrypoint, ["dataset", *flags, "--output-path", tmp_path / "pictures"])
+    sizes = {Image.open(path).size for path in (tmp_path / "pictures").rglob("*.jpg")}
+    assert sizes == {(16, 12 if parser == "llff-data" else 16)}

@@ -224,6 +224,15 @@ def test_what_cannot_be_used_is_refused_at_once(photos, painting, monkeypatch, c
         stylise(monkeypatch, Path(given["photos"]), given["painting"], "--seed", str(given["seed"]))
 
 
+@pytest.mark.parametrize("content", [b"", b"not a picture"])
+def test_a_painting_that_cannot_be_read_is_refused_before_the_first_stage(photos, tmp_path, monkeypatch, content):
+    bad = tmp_path / "bad.png"
+    bad.write_bytes(content)
+    monkeypatch.setattr(stages_module, "run_command", lambda *_: pytest.fail("a stage was begun"))
+    with pytest.raises(SystemExit, match=r"bad\.png"):
+        stylise(monkeypatch, photos, bad)
+
+
 def test_is_scene_needs_images_beside_llff_poses(photos):
     assert not stylise_module.is_scene(photos)
     (photos / "transforms.json").write_text("{}")
