@@ -22,7 +22,7 @@ from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes
 from sparsestyle_ns.runs.scene_record import find_thumbnail
 from sparsestyle_ns.utils.files import free_name
-from sparsestyle_ns.viewer.adjustments import begin_at_central_photo, hide_frustums, keep_outputs
+from sparsestyle_ns.viewer.adjustments import begin_at_central_photo, hide_frustums, keep_outputs, make_rays_once
 from sparsestyle_ns.viewer.baking import Baker
 from sparsestyle_ns.viewer.restyling_controls import Pace, RestylingControls, losses_text
 from sparsestyle_ns.viewer.splat_controls import SplatControls
@@ -63,6 +63,7 @@ class StylePanel(ViewerControl):
         self.describe_run()
         keep_outputs(viewer, OUTPUTS, self.apply_split)
         hide_frustums(viewer)
+        make_rays_once()
         cameras = self.pipeline.datamanager.train_dataset.cameras
         begin_at_central_photo(viewer, cameras)
         self.pipeline.model.display.viewer = self.look
