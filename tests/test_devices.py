@@ -240,6 +240,8 @@ def test_all_commands_run_there(device: SecondDevice, llff_scene: Path, painting
     sparsestyle("evaluate", run, "--baked", "--output-path", tmp_path / "report.json")
     sparsestyle("export", run, "--format", "html", "--output-path", tmp_path / "page.html", "--resolution", "32")
     sparsestyle("export", run, "--format", "ply", "--output-path", tmp_path / "points.ply")
+    for kind in ("splat", "mesh"):
+        sparsestyle("export", run, "--format", kind, "--output-path", tmp_path / f"{kind}.ply", "--max-splats", "1000")
     sparsestyle("gallery", run, "--output-path", tmp_path / "gallery.html", "--frames", "2")
     sparsestyle("effects", "--data", llff_scene)
     render("interpolate", run, tmp_path / "between", "--output-format", "images", "--interpolation-steps", "2")
