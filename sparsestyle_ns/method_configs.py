@@ -85,8 +85,8 @@ hier_style = method(
     "A coarse-fewshot scene in the style of a painting, --style-image FILE (stage 2); both under ten minutes there.",
     coarse_method=coarse_fewshot_config,
     method_name="hier-style",
-    max_num_iterations=240,
-    steps_per_save=60,
+    max_num_iterations=400,
+    steps_per_save=100,
     steps_per_log=5,
     pipeline=HierStylePipelineConfig(datamanager=FewShotDataManagerConfig(), panel=StylePanel),
     optimizers={"fields": adam(5e-3, ShareSchedulerConfig(warm_up=0.075, milestones=(0.5, 0.8)))},
@@ -111,7 +111,12 @@ hier_style_draft = variant(
     hier_style,
     "-draft",
     f"hier-style {A_FIRST_LOOK}",
-    {**DRAFT, "coarse_method": coarse_fewshot_draft_config, "max_num_iterations": 80},
+    {
+        **DRAFT,
+        "coarse_method": coarse_fewshot_draft_config,
+        "max_num_iterations": 80,
+        "pipeline.scale_shares": (0.85, 0.15),
+    },
 )
 
 THE_PAPER = "with the paper's own settings: hours on a CPU, for comparisons."
@@ -143,6 +148,7 @@ hier_style_paper = variant(
         "coarse_method": coarse_fewshot_paper_config,
         "max_num_iterations": 200,
         "pipeline.effects": EffectSettings(view_color="on", matched_depth="off", residual_density="on", palette="off"),
+        "pipeline.view_side": None,
         "pipeline.view_scales": (1.0,),
         "pipeline.scale_shares": (1.0,),
         "pipeline.content_share": 0.5,

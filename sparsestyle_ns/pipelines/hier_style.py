@@ -42,17 +42,21 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     coarse_run: Annotated[Optional[Path], tyro.conf.arg(aliases=("--coarse-run",))] = None
     """Folder or config.yml of the coarse-fewshot run to stylise. None: the newest finished one that matches the data
     and its settings, and where there is none it is trained first."""
+    view_side: Optional[int] = 252
+    """Longer side, in pixels, of the views that are stylised, where photos are larger; with strokes finer than 1 as many
+    times more. Pictures are of any size all the same. In larger views the style loss makes ripples as fine as bristles,
+    finer than the geometry of few photos can hold together. None: the photos' size."""
     view_scales: Tuple[float, ...] = (0.5, 1.0)
-    """Sizes at which the views are stylised, one after another, as shares of the photos'; the last is the one that
+    """Sizes at which the views are stylised, one after another, as shares of `view_side`; the last is the one that
     counts, and iterations before it are quick."""
-    scale_shares: Tuple[float, ...] = (0.85, 0.15)
+    scale_shares: Tuple[float, ...] = (0.5, 0.5)
     """Shares of the iterations at these sizes."""
     stroke_size: Annotated[float, tyro.conf.arg(aliases=("--stroke-size",))] = 1.0
     """How wide strokes are, from 0.5 to 2: the feature network sees views and painting in this many times smaller
     pictures, where its patches are as many times wider. 0.5 takes four times the network's time and memory."""
     feature_side: Optional[int] = None
-    """Longer side, in pixels, at which the network sees views of the photos' size where strokes are of size 1. None:
-    theirs."""
+    """Longer side, in pixels, at which the network sees the largest views where strokes are of size 1. None: that of
+    the views."""
     style_features: Optional[int] = None
     """Match with at most so many of the painting's feature vectors, drawn at random; None: all of them."""
     loss_weights: Dict[str, float] = field(default_factory=default_weights)
@@ -92,6 +96,8 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
                 raise InputError(f"--pipeline.loss-weights names {name}, which is no loss; the losses are {known}.")
             if not 0.0 <= weight < math.inf:
                 raise InputError(f"--pipeline.loss-weights.{name} is {weight}; give a finite number, 0 or more.")
+        if self.view_side is not None and self.view_side < 1:
+            raise InputError(f"--pipeline.view-side is {self.view_side}; give a number of pixels, or None.")
         if not 0.0 < self.object_style < math.inf:
             raise InputError(f"--pipeline.object-style is {self.object_style}; give a number above 0.")
         if not any(self.loss_weights.values()):
@@ -106,14 +112,20 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
             raise InputError(f"--pipeline.content-restart is {self.content_restart}; give a number above 0.")
         return coarse_to_fine(self.view_scales, self.scale_shares, iterations)
 
+    def share_of_photos(self, scale: float, photo_side: int) -> float:
+        """What views at one of the `view_scales` have of the longer side of their photos, at most 1."""
+        finest = (self.view_side or photo_side) / min(1.0, self.stroke_size)
+        return scale * min(1.0, finest / photo_side)
+
     def side_at(self, scale: float, photo_side: int) -> int:
-        """Longer side, in pixels, at which the network sees views at a scale of photos of a size, and the painting."""
-        return max(1, round(scale * (self.feature_side or photo_side) / self.stroke_size))
+        """Longer side, in pixels, at which the network sees views at one of the `view_scales`, and the painting."""
+        largest = self.feature_side or min(photo_side, self.view_side or photo_side)
+        return max(1, round(scale * largest / self.stroke_size))
 
     def targets_of(
         self, painting: Painting, backbone: Backbone, device: torch.device, photo_side: int, scale: float = 1.0
     ) -> StyleTargets:
-        """A painting as the feature network sees it, for views at a scale of photos of a size, with these settings.
+        """A painting as the feature network sees it, for views at one of the `view_scales`, with these settings.
 
         The network moves to the device.
         """
@@ -161,7 +173,7 @@ class HierStylePipeline(CheckedPipeline):
     style: Optional[Tuple[Painting, Backbone]] = None
     """Painting and network; given before training is set up by whoever has read them already."""
     targets: Optional[StyleTargets] = None
-    """The painting, once training is set up, for views of the photos' size."""
+    """The painting, once training is set up, for the largest views."""
     scene_views: Optional[SceneViews] = None
     task: Optional[StyleTask] = None
     """What this run trains, once it is set up."""
@@ -185,14 +197,14 @@ class HierStylePipeline(CheckedPipeline):
         if self.scene_views is None:
             self.scene_views = self.freeze_views()
         targets = [self.targets_of(painting, backbone, level.scale, stroke_size) for level in schedule]
-        scales = [level.scale for level in schedule]
+        scales = [self._share_of_photos(level.scale) for level in schedule]
         views = self.scene_views.for_painting(dict(zip(scales, targets, strict=True)), effects)
         return StyleTask(style, list(map(StyleLevel, schedule, targets, views)))
 
     def targets_of(
         self, painting: Painting, backbone: Backbone, scale: float = 1.0, stroke_size: Optional[float] = None
     ) -> StyleTargets:
-        """A painting as the feature network sees it, for views at a scale of the photos."""
+        """A painting as the feature network sees it, for views at one of the `view_scales`."""
         config = self.config if stroke_size is None else replace(self.config, stroke_size=stroke_size)
         return config.targets_of(painting, backbone, self.device, self.datamanager.photo_side, scale)
 
@@ -200,7 +212,11 @@ class HierStylePipeline(CheckedPipeline):
         """The scene's views, with all that depends on no style."""
         config = self.config
         sizes = config.novel_views, config.samples_per_chunk, config.cache_gigabytes
-        return SceneViews(self.model, self.datamanager, config.view_scales, *sizes)
+        scales = [self._share_of_photos(scale) for scale in config.view_scales]
+        return SceneViews(self.model, self.datamanager, scales, *sizes)
+
+    def _share_of_photos(self, scale: float) -> float:
+        return self.config.share_of_photos(scale, self.datamanager.photo_side)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
