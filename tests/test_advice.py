@@ -558,7 +558,7 @@ TABLE = [
         "sparsestyle evaluate {coarse} --output-path ./report.json",
     ),
     Advice(
-        "name another file with --output-path",
+        "; name another place with ",
         "sparsestyle evaluate {coarse} --output-path {painting}/report.json",
         "sparsestyle evaluate {coarse} --output-path report.json",
     ),
@@ -662,11 +662,7 @@ TABLE = [
     ),
     Advice(" is a folder; give ", None, None),  # tests/test_ctrl_c.py, as the next
     Advice("There is no run's config at --load-config ", None, None),
-    Advice(
-        "Something is at --output-path ",
-        lambda place: into_pictures("pictures", place),
-        views("rgb --output-path pictures-2"),
-    ),
+    Advice("Something is at ", lambda place: into_pictures("pictures", place), views("rgb --output-path pictures-2")),
     Advice(
         " is no name of a film; take ",
         flight("--output-format video --output-path a.txt"),

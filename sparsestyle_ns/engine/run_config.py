@@ -11,7 +11,7 @@ import tyro
 import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
-from sparsestyle_ns.pipelines.render_command import begin_render
+from sparsestyle_ns.pipelines.ns_commands import begin_command
 from sparsestyle_ns.runs.checkpoints import checkpoint_path, checkpoint_step, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import read_config
 from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord
@@ -33,7 +33,7 @@ class RunConfig(TrainerConfig):
     def __setstate__(self, state: Dict[str, Any]) -> None:
         """Called when a config.yml is read, which nerfstudio's commands do first of all."""
         vars(self).update(state)
-        begin_render()
+        begin_command()
 
     def get_base_dir(self) -> Path:
         """The run's folder."""

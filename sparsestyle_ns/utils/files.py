@@ -54,8 +54,15 @@ def free_path(path: Path) -> Path:
     """A path at which nothing is yet: this, else with a number behind the name."""
     found, number = path, 2
     while found.exists():
-        found, number = path.with_name(f"{path.stem}-{number}{path.suffix}"), number + 1
+        found, number = numbered(path, number), number + 1
     return found
+
+
+def numbered(path: Path, number: int) -> Path:
+    """A path beside another, with a number behind its name: also beside `.`, which has none."""
+    if path.name in ("", ".."):
+        path = path.resolve()
+    return path.with_name(f"{path.stem}-{number}{path.suffix}")
 
 
 def keep_former(path: Path, content: str) -> Optional[Path]:
@@ -90,14 +97,14 @@ def prepare_output(output_path: Path, what: str, example: str, force: bool = Fal
         raise not_writable(output_path, what, error.strerror) from error
 
 
-def check_writable(path: Path, what: str) -> None:
+def check_writable(path: Path, what: str, flag: str = "--output-path") -> None:
     """An `InputError`, as of `prepare_output`, where a file or a folder can't be made; nothing is left of the trial."""
     around = next(folder for folder in path.absolute().parents if folder.exists())
     try:
         with tempfile.TemporaryFile(dir=around):
             pass
     except OSError as error:
-        raise not_writable(path, what, error.strerror) from error
+        raise not_writable(path, what, error.strerror, flag) from error
 
 
 def write_output(output_path: Path, content: Union[str, bytes], what: str, example: str) -> Path:
@@ -112,9 +119,9 @@ def write_output(output_path: Path, content: Union[str, bytes], what: str, examp
         raise not_writable(output_path, what, error.strerror) from error
 
 
-def not_writable(output_path: Path, what: str, reason: Optional[str]) -> InputError:
-    """An error that says why a command can't write a file."""
-    return InputError(f"{what} can't be written to {output_path} ({reason}); name another file with --output-path.")
+def not_writable(output_path: Path, what: str, reason: Optional[str], flag: str = "--output-path") -> InputError:
+    """An error that says why a command can't write to the place that a flag named."""
+    return InputError(f"{what} can't be written to {output_path} ({reason}); name another place with {flag}.")
 
 
 def free_name(name: str, taken: Iterable[str]) -> str:
