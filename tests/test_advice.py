@@ -65,7 +65,9 @@ def test_what_is_printed_names_flags_and_commands_that_exist() -> None:
 
     programs = {script.name for script in importlib.metadata.entry_points(group="console_scripts")}
     theirs = nerfstudio_flags("ns-render") | nerfstudio_flags("ns-viewer") | {"--gpu", "--no-gpu"}
-    theirs |= nerfstudio_flags("ns-process-data") | {"--matching-method", "--num-downscales"}  # of its base classes
+    theirs |= (
+        nerfstudio_flags("ns-export") | nerfstudio_flags("ns-process-data") | {"--matching-method", "--num-downscales"}
+    )  # of its base classes
     known, wrong = all_flags() | theirs | {"--help", "--force", "--load-config"}, []
     for sentence in printed_strings():
         for flag in FLAG.findall(sentence.text):
@@ -648,6 +650,13 @@ TABLE = [
         "sparsestyle export {style} --format splat --max-splats 10 --output-path a.ply",
         None,
     ),
+    # ns-export, in tests/export/test_ns_export.py
+    Advice("has no Gaussians yet; have them made by sparsestyle export RUN --format splat", None, None),
+    Advice("has no signed distances; take ns-export poisson --normal-method open3d", None, None),
+    Advice("has no normals of its own; add --normal-method open3d", None, None),
+    Advice("--obb-center, --obb-rotation and --obb-scale have an effect only together", None, None),
+    # ns-eval, in tests/test_nothing_lost.py
+    Advice("ns-eval writes JSON, and --output-path is ", None, None),
     # ns-render; more in tests/pipelines/test_render_command.py
     Advice("; give a number above 0.", views("rgb --downscale-factor 0"), views("rgb --downscale-factor 1")),
     Advice(", and leaves less than ", views("rgb --downscale-factor 4"), views("rgb --downscale-factor 2")),
@@ -660,6 +669,7 @@ TABLE = [
         flight("--rendered-output-names rgba"),
         flight("--rendered-output-names rgba --image-format png"),
     ),
+    Advice(" can't be made, as ", None, None),  # tests/export/test_ns_export.py
     Advice(" is a folder; give ", None, None),  # tests/test_ctrl_c.py, as the next
     Advice("There is no run's config at --load-config ", None, None),
     Advice("Something is at ", lambda place: into_pictures("pictures", place), views("rgb --output-path pictures-2")),

@@ -168,6 +168,29 @@ def test_a_file_that_is_there_is_written_over_only_where_that_is_asked_for(
         assert target.read_text(errors="replace") != "mine"
 
 
+def test_figures_of_ns_eval_never_take_the_place_of_others(
+    runs: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = "--load-config", runs.coarse / "config.yml"
+    Path("output.json").write_text("mine")
+    ns_command("ns-eval", *config)  # without a name it takes a new one
+    assert Path("output.json").read_text() == "mine" and Path("output-2.json").is_file()
+    Path("pictures").mkdir()
+    Path("pictures/mine.png").touch()
+    before = files_below(tmp_path)
+    for flags, sentence in (
+        (["--output-path", "output-2.json"], "take output-2-2.json or another place"),
+        (["--output-path", "report.txt"], "ns-eval writes JSON, .* take report.txt.json"),
+        (["--output-path", "pictures"], "ns-eval writes JSON, .* take pictures.json"),
+        (["--output-path", "output.json/a.json"], "name another place with --output-path"),
+        (["--output-path", "a.json", "--render-output-path", "pictures"], "--render-output-path .* take pictures-2"),
+    ):
+        with pytest.raises(SystemExit, match=sentence):
+            ns_command("ns-eval", *config, *flags)
+    assert files_below(tmp_path) == before
+
+
 def test_a_gallery_without_a_name_gets_one_of_its_own(
     runs: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -211,6 +234,13 @@ def test_free_names_keep_suffixes_and_count_on(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     assert free_path(tmp_path / "a.html") == tmp_path / "a-3.html"
     assert free_path(tmp_path / "folder") == tmp_path / "folder-2"
+
+
+def test_the_folder_that_one_is_in_has_free_names_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here" / "below").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here" / "below")
+    assert free_path(Path(".")) == tmp_path / "here" / "below-2"
+    assert free_path(Path("..")) == tmp_path / "here-2"
 
 
 def test_a_painting_is_painted_over_only_where_that_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
