@@ -22,6 +22,7 @@ from test_docs import ROOT, all_flags, nerfstudio_flags, subcommands
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.studies.time_budget import Budget
 from sparsestyle_ns.utils.errors import InputError
 
 FLAG = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
@@ -100,16 +101,22 @@ def place(
     from nerfstudio.utils import writer
 
     from sparsestyle_ns.studies import paper_studies, tradeoff
-    from sparsestyle_ns.studies.tradeoff_report import Report
 
     monkeypatch.setattr(Trainer, "train", lambda trainer: None)
     monkeypatch.setattr(writer, "setup_event_writer", lambda *arguments, **settings: None)
     monkeypatch.setattr(paper_studies, "_run_study", lambda title, options, *rest: options.output_path)
-    monkeypatch.setattr(tradeoff, "measure", lambda study, options, budget: Report("fern", {}, []))
+    monkeypatch.setattr(tradeoff, "measure", quick_report)
     monkeypatch.chdir(tmp_path)
     return SimpleNamespace(
         scene=llff_scene, painting=painting, coarse=runs.coarse, style=runs.style, outputs=tmp_path / "outputs"
     )
+
+
+def quick_report(study: object, options: object, budget: Budget) -> SimpleNamespace:
+    """What `sparsestyle tradeoff` finds: something, unless there is less than a second for it."""
+    measured = [] if budget.left < 1.0 else ["a curve"]
+    lists = {"measured": measured, "recommendation": [], "left_out": [], "everything_left_out": lambda: []}
+    return SimpleNamespace(**lists, write=lambda folder: folder / "index.html")
 
 
 def typed(command: str, place: SimpleNamespace) -> None:
@@ -618,12 +625,21 @@ TABLE = [
         None,  # a line of the report
         "sparsestyle tradeoff --data {scene} --style-image {painting}",
     ),
-    Advice("give a larger --budget", None, "sparsestyle tradeoff --data {scene} --budget 20m"),  # the same
+    Advice(
+        "give a larger --budget",
+        "sparsestyle tradeoff --data {scene} --budget 0.1s",
+        "sparsestyle tradeoff --data {scene} --budget 20m",
+    ),
     # Photos
     Advice(
         "name a folder that isn't, with --output",
-        lambda place: typed(f"sparsestyle prepare {photos(place)} --output photos", place),
+        lambda place: typed(f"sparsestyle prepare {photos(place)} --output {place.scene}", place),
         "sparsestyle prepare photos --output made",
+    ),
+    Advice(
+        " is in the folder of the photos, which are only read; take ",
+        lambda place: typed(f"sparsestyle prepare {photos(place)} --output photos/made", place),
+        "sparsestyle prepare photos --output photos-scene",
     ),
     Advice("leave --poses file out", None, None),  # tests/prepare
     Advice("pip install pillow-heif", read_heic, None),

@@ -6,16 +6,14 @@ therefore run once more within itself, from where it has read the run's config.y
 whether it comes to its end.
 """
 
-import shutil
 import signal
 import sys
-from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Iterator, List, Optional
+from typing import Any, List, Optional
 
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.files import check_writable, not_writable, numbered
-from sparsestyle_ns.utils.interrupts import ending_on, ns_command, stop_if_pressed, take_away_at_end
+from sparsestyle_ns.utils.files import all_or_nothing, check_writable, not_writable, numbered
+from sparsestyle_ns.utils.interrupts import ending_on, ns_command, stop_if_pressed
 
 SCRIPTS = {"render": "What is rendered", "exporter": "What is exported", "eval": "The figures"}
 """nerfstudio's modules of commands that write something, and what that is."""
@@ -134,25 +132,3 @@ def run_whole(command: Any, script: str) -> None:
         if unwritten:
             raise not_writable(unwritten[0], what, "Open3D has failed", flag)
     raise SystemExit(0)
-
-
-@contextmanager
-def all_or_nothing(paths: List[Path]) -> Iterator[None]:
-    """What is made at these paths, at which nothing is yet, goes away where the context doesn't come to its end."""
-    folders = {part for path in paths for part in (path, *path.parents) if not part.exists()}
-    unfinished = list(paths)
-
-    def take_away() -> None:
-        for path in unfinished:
-            for part in path.iterdir() if path.is_dir() else [path]:
-                shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
-        for folder in sorted(folders, key=lambda folder: len(folder.parts), reverse=True) if unfinished else ():
-            with suppress(OSError):  # never made, or somebody else has put something there
-                folder.rmdir()
-
-    take_away_at_end(take_away)
-    try:
-        yield
-        unfinished.clear()
-    finally:
-        take_away()

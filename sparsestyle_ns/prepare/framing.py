@@ -59,6 +59,8 @@ class Framing:
 
 def find_photos(folder: Path) -> List[Path]:
     """The photos of a folder or, if it has none, of its folder `images`, by name; an `InputError` if fewer than 3."""
+    if folder.is_file():
+        raise InputError(f"{folder} is a file, and no video; name the folder that the photos are in.")
     if not folder.is_dir():
         raise InputError(f"There is no folder {folder}; name the folder that the photos are in.")
     for place in (folder, folder / "images"):

@@ -3,11 +3,14 @@
 import hashlib
 import os
 import re
+import shutil
 import tempfile
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePath
-from typing import BinaryIO, Callable, Iterable, Optional, Union
+from typing import BinaryIO, Callable, Iterable, Iterator, List, Optional, Union
 
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.interrupts import take_away_at_end
 
 LONGEST, LONGEST_SUFFIX = 120, 16
 """UTF-8 bytes of a file's name, and characters of its suffix, at most: some file systems take 143 bytes."""
@@ -40,6 +43,28 @@ def write_whole(
     finally:
         os.close(folder)
     return target
+
+
+@contextmanager
+def all_or_nothing(paths: List[Path]) -> Iterator[None]:
+    """What is made at these paths, at which nothing is yet, goes away where the context doesn't come to its end."""
+    folders = {part for path in paths for part in (path, *path.parents) if not part.exists()}
+    unfinished = list(paths)
+
+    def take_away() -> None:
+        for path in unfinished:
+            for part in path.iterdir() if path.is_dir() else [path]:
+                shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
+        for folder in sorted(folders, key=lambda folder: len(folder.parts), reverse=True) if unfinished else ():
+            with suppress(OSError):  # never made, or somebody else has put something there
+                folder.rmdir()
+
+    take_away_at_end(take_away)
+    try:
+        yield
+        unfinished.clear()
+    finally:
+        take_away()
 
 
 def digest(*contents: bytes) -> str:
@@ -95,6 +120,16 @@ def prepare_output(output_path: Path, what: str, example: str, force: bool = Fal
             pass
     except OSError as error:
         raise not_writable(output_path, what, error.strerror) from error
+
+
+def check_outside(output: Path, inputs: Path) -> None:
+    """An `InputError` where a folder that `--output` names is a person's own folder of photos, or in it."""
+    output, inputs = output.resolve(), inputs.resolve()
+    if inputs.is_dir() and (output == inputs or inputs in output.parents):
+        raise InputError(
+            f"--output {output} is in the folder of the photos, which are only read; take "
+            f"{free_path(inputs.with_name(f'{inputs.name}-scene'))} or another place outside of it."
+        )
 
 
 def check_writable(path: Path, what: str, flag: str = "--output-path") -> None:

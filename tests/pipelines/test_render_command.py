@@ -19,9 +19,10 @@ from nerfstudio.scripts import render
 from PIL import Image
 
 from sparsestyle_ns.pipelines import nerfstudio_options as options
-from sparsestyle_ns.pipelines.command_output import all_or_nothing, claim_output
+from sparsestyle_ns.pipelines.command_output import claim_output
 from sparsestyle_ns.pipelines.render_command import find_ends, read_camera_path
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import all_or_nothing
 
 CAMERA = {"camera_to_world": np.eye(4).flatten().tolist(), "fov": 50, "aspect": 1}
 CROP = {

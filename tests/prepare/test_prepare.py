@@ -300,6 +300,32 @@ def test_a_folder_with_something_in_it_is_left_alone(tmp_path):
     assert [path.name for path in (tmp_path / "scene").iterdir()] == ["mine.txt"]
 
 
+@pytest.mark.parametrize("name", ["photos", "photos/inside", "photos/new/scene", "linked/inside"])
+def test_a_scene_is_never_written_into_the_folder_of_the_photos(tmp_path, name):
+    write_photos(tmp_path / "photos")
+    write_poses_bounds(tmp_path / "photos")
+    (tmp_path / "linked").symlink_to(tmp_path / "photos")
+    (tmp_path / "photos-scene").touch()
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "photos").rglob("*")}
+    with pytest.raises(InputError, match=f"only read; take {tmp_path / 'photos-scene-2'} or another place outside"):
+        prepare_scene(tmp_path / "photos", tmp_path / name)
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "photos").rglob("*")} == before
+    assert prepare_scene(tmp_path / "photos", tmp_path / "photos-scene-2").names
+
+
+def test_a_place_that_cant_be_written_to_is_said_before_photos_are_read(tmp_path):
+    (tmp_path / "photos").mkdir()  # without any
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"The scene can't be written to .* name another place with --output\."):
+        prepare_scene(tmp_path / "photos", tmp_path / "file" / "scene")
+
+
+def test_a_file_that_is_no_video_is_called_so(tmp_path):
+    (tmp_path / "photo.jpg").touch()
+    with pytest.raises(InputError, match=r"photo\.jpg is a file, and no video; name the folder"):
+        prepare_scene(tmp_path / "photo.jpg", tmp_path / "scene")
+
+
 def test_poses_are_asked_of_a_file_that_is_not_there(tmp_path):
     write_photos(tmp_path / "photos")
     with pytest.raises(InputError, match=r"Neither poses_bounds.npy nor transforms.json"):
