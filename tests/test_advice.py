@@ -374,6 +374,17 @@ def skip_all(place: SimpleNamespace) -> None:
     trainer._look_at_skipped(19)
 
 
+def is_held(place: SimpleNamespace) -> None:
+    from sparsestyle_ns.runs import run_folder
+
+    def held(*arguments: object) -> None:
+        raise BlockingIOError
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run_folder.fcntl, "flock", held)
+        typed(coarse("--timestamp held"), place)
+
+
 NO_ERRORS = (
     "A coarse-fewshot scene in the style of a painting, ",  # help
     "Tools around stylised scenes. ",
@@ -390,6 +401,7 @@ TABLE = [
     Advice(" would leave no image to train on", coarse("", "--eval-interval 1"), coarse("", "--eval-interval 2")),
     Advice(" is no scale: give a number", coarse("", "--bound-scale 0"), coarse("", "--bound-scale 0.75")),
     Advice(" names no folder: give N", coarse("", "--downscale-factor 0"), coarse("", "--downscale-factor 1")),
+    Advice("; name the folder of a scene.", "sparsestyle effects --data {coarse}", effects("")),
     Advice("name it last, such as colmap", "sparsestyle effects --data .", effects("llff-data")),
     Advice(
         "put the photos there, or choose another folder with --downscale-factor",

@@ -6,6 +6,8 @@ import json
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Dict, List
@@ -126,6 +128,30 @@ def test_runs_that_begin_in_one_second_have_folders_of_their_own(tmp_path: Path)
         config.get_base_dir().mkdir(parents=True)
         names.append(config.timestamp)
     assert len(set(names)) == 2
+
+
+HOLD = """
+import sys, pathlib
+from sparsestyle_ns.runs.run_folder import hold_folder
+hold_folder(pathlib.Path(sys.argv[1]))
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_two_commands_never_train_in_one_folder_at_once(llff_scene: Path, tmp_path: Path) -> None:
+    """The first has no checkpoint yet, by which the second would see that there is a run."""
+    folder = tmp_path / "outputs" / llff_scene.name / "coarse-fewshot" / "first"
+    command = [sys.executable, "-c", HOLD, str(folder)]
+    flags = ["--timestamp", "first", "--max-num-iterations", "1", *TINY]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(SystemExit, match=r"Another ns-train is at work in .*first right now; wait .*--timestamp"):
+            ns_train("coarse-fewshot", llff_scene, tmp_path / "outputs", *flags)
+        assert folder.is_dir() and not list(folder.iterdir())
+        other.communicate()
+    ns_train("coarse-fewshot", llff_scene, tmp_path / "outputs", *flags)
+    assert steps(folder) == [0]
 
 
 def test_a_report_of_something_else_is_kept_under_another_name(run: Path, capsys: pytest.CaptureFixture) -> None:

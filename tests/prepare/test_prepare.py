@@ -18,6 +18,8 @@ from photo_sets import (
     write_transforms,
 )
 from PIL import ExifTags, Image
+from test_commands import write_ring
+from test_commands import write_transforms as write_capture
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
@@ -318,6 +320,23 @@ def test_a_place_that_cant_be_written_to_is_said_before_photos_are_read(tmp_path
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=r"The scene can't be written to .* name another place with --output\."):
         prepare_scene(tmp_path / "photos", tmp_path / "file" / "scene")
+
+
+def test_photos_without_a_frame_and_frames_without_a_photo_are_named(tmp_path, capsys):
+    write_capture(tmp_path, write_ring(tmp_path))
+    for old, new in (("2.png", "other.png"), ("4.png", "more.png")):
+        (tmp_path / "images" / old).rename(tmp_path / "images" / new)
+    assert len(prepare_scene(tmp_path, tmp_path.with_name("made")).names) == 4
+    printed = capsys.readouterr().out
+    assert "whose photos aren't there, and are left out: images/2.png, images/4.png\n" in printed
+    assert "which are left out: more.png, other.png\n" in printed
+
+
+def test_a_link_that_leads_nowhere_is_no_photo_that_one_passes_over(tmp_path):
+    write_photos(tmp_path / "photos")
+    (tmp_path / "photos" / "link.jpg").symlink_to("nowhere.jpg")
+    with pytest.raises(InputError, match=r"There is no photo .*link\.jpg, whose link leads nowhere"):
+        prepare_scene(tmp_path / "photos", tmp_path / "scene")
 
 
 def test_a_file_that_is_no_video_is_called_so(tmp_path):
