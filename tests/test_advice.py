@@ -470,6 +470,17 @@ TABLE = [
         coarse("--machine.device-type cpu"),
     ),
     Advice("name a folder that can be written to with --output-dir", no_room, coarse("--output-dir elsewhere")),
+    Advice(
+        "leave --load-step out to go on from ",
+        lambda place: goes_on("--load-step 7 --max-num-iterations 4", place),
+        lambda place: goes_on("--max-num-iterations 4", place),
+    ),
+    Advice(
+        " is a folder; name it with --load-dir",
+        lambda place: typed(coarse(f"--load-checkpoint {place.coarse}/nerfstudio_models"), place),
+        lambda place: goes_on("--max-num-iterations 4", place),
+    ),
+    Advice("or name a new run with --timestamp", is_held, coarse("--timestamp b")),
     Advice("already; name a new one with --timestamp", lambda place: twice("first", place), coarse("--timestamp b")),
     Advice(
         "give shares from 0 to 1 with --optimizers.GROUP.scheduler",

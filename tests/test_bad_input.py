@@ -188,10 +188,7 @@ def test_nothing_to_resume_is_said(llff_scene: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("flags", "sentence"),
     [
-        (
-            "--load-dir {models} --load-step 7",
-            "There is no checkpoint of iteration 7 in .* leave --load-step out to go on",
-        ),
+        ("--load-dir {models} --load-step 7", "no checkpoint of iteration 7 in .* leave --load-step out to go on"),
         ("--load-dir {models} --load-step -1", "There is no checkpoint of iteration -1 in .* go on from 2, the newest"),
         ("--load-dir {models}/step-000000002.ckpt", "There is no checkpoint in .*ckpt; name a run's nerfstudio_models"),
         ("--load-checkpoint {models}", "--load-checkpoint .* is a folder; name it with --load-dir"),

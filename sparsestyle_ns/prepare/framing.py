@@ -96,9 +96,7 @@ def read_photo(path: Path, upright: bool = True) -> Photo:
             orientation, pixels = orientation_of(image), to_8_bits(image, data)
             return Photo(path, as_upright(pixels, orientation) if upright else pixels, orientation, upright, exif)
     except FileNotFoundError as error:
-        raise InputError(
-            f"There is no photo {path}, whose link leads nowhere; put it there, or take it out."
-        ) from error
+        raise InputError(f"{path} is a link that leads nowhere; put the photo there, or take it out.") from error
     except UnknownPixelsError as error:
         raise InputError(f"{path} has {error}; save it as 8-bit RGB or grey, or take it out.") from error
     except UnidentifiedImageError as error:
