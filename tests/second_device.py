@@ -84,6 +84,8 @@ def _tensors(*values: Any) -> List[Tensor]:
 
 
 def _storage(tensor: Tensor) -> Optional[torch.UntypedStorage]:
+    while torch._C._functorch.is_functorch_wrapped_tensor(tensor):  # as torch.func's functions see their arguments
+        tensor = torch._C._functorch.get_unwrapped(tensor)
     return None if tensor.is_meta else tensor.untyped_storage()
 
 

@@ -1,6 +1,7 @@
 """Both methods on a second device (`second_device.py`): nothing is left on the CPU, and little is waited for."""
 
 import copy
+import json
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Dict, Iterator
@@ -9,8 +10,9 @@ import pytest
 import torch
 from conftest import TINY, TINY_STYLE, ns_train, only_run, run_entrypoint
 from interpreted_kernels import interpreted_kernels
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from second_device import CUDA, SecondDevice
-from test_commands import render
+from test_commands import render, write_ring, write_transforms
 
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
 from sparsestyle_ns.effects.decisions import EffectSettings
@@ -141,6 +143,7 @@ slow = pytest.mark.slow
             {"model__occlusion_weight": 0.1},
             marks=slow,
         ),
+        pytest.param({"pose_refinement": "on", "matched_depth": "on"}, {}, marks=slow, id="pose refinement"),
         pytest.param(
             {"empty_space": "auto"},
             {"semantic_weight": 0.1, "semantic_every": 2, "model__frequency_reveal": 0.9},
@@ -157,6 +160,27 @@ def test_stage_1_trains_there(device: SecondDevice, llff_scene: Path, effects: d
     look(training)
     held = {name: str(value.device) for name, value in training.pipeline.state_dict().items()}
     assert set(held.values()) == {"cuda:0"}, held
+
+
+@pytest.mark.slow
+def test_distorted_cameras_around_a_box_train_and_render_there(
+    device: SecondDevice, painting: Path, tmp_path: Path
+) -> None:
+    write_transforms(tmp_path, write_ring(tmp_path))
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    (tmp_path / "transforms.json").write_text(json.dumps({**content, "k1": 0.1, "p1": 0.01}))
+    effects = {"box": "on", "contraction": "off", "lens_distortion": "on", "residual_density": "on"}
+    coarse, style = coarse_config(tmp_path, effects), style_config(tmp_path, painting, effects)
+    for config in (coarse, style):
+        config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig()
+    training = Training(coarse, CUDA)
+    training.step()
+    look(training)
+    training = Training(style, CUDA, training.pipeline.model.state_dict())
+    training.step()
+    look(training)
+    with training.pipeline.model.display.rendering("baked"):
+        look(training)
 
 
 @pytest.mark.parametrize(
@@ -216,6 +240,8 @@ def test_all_commands_run_there(device: SecondDevice, llff_scene: Path, painting
     sparsestyle("evaluate", run, "--baked", "--output-path", tmp_path / "report.json")
     sparsestyle("export", run, "--format", "html", "--output-path", tmp_path / "page.html", "--resolution", "32")
     sparsestyle("export", run, "--format", "ply", "--output-path", tmp_path / "points.ply")
+    for kind in ("splat", "mesh"):
+        sparsestyle("export", run, "--format", kind, "--output-path", tmp_path / f"{kind}.ply", "--max-splats", "1000")
     sparsestyle("gallery", run, "--output-path", tmp_path / "gallery.html", "--frames", "2")
     sparsestyle("effects", "--data", llff_scene)
     render("interpolate", run, tmp_path / "between", "--output-format", "images", "--interpolation-steps", "2")

@@ -81,6 +81,19 @@ def test_parts_can_be_left_out_and_those_without_time_are_named(run, capsys, mon
     assert "--skip and --only know the parts" in str(run(capsys, only=("everything",)).status)
 
 
+def test_a_part_has_its_share_of_the_time_and_what_those_before_it_left(run, capsys, monkeypatch):
+    left = []
+
+    def work(check):
+        """Looks at the clock."""
+        left.append(check.seconds_left())
+        return {}
+
+    monkeypatch.setattr(gpu_check, "PARTS", {"kernels": (work, 10.0), "equal": (part(), 30.0), "whole": (work, 40.0)})
+    assert run(capsys, minutes=4.0).status == 0
+    assert left == [pytest.approx(30.0, abs=8.0), pytest.approx(240.0, abs=8.0)]
+
+
 def test_random_numbers_are_the_cpus_on_every_device():
     drawn = {}
     for device in ("cpu", "cuda"):

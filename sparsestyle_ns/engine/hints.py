@@ -93,8 +93,6 @@ def resume_command(method: str, checkpoints: Path, typed: Optional[Sequence[str]
     typed = sys.argv[1:] if typed is None else list(typed)
     if any(part.split("=")[0].replace("_", "-") == "--load-config" for part in typed):  # with which no flag counts
         return ["ns-train", method, "--load-config", str(checkpoints.parent / "config.yml")]
-    if any(part.split("=")[0].replace("_", "-") == "--load-config" for part in typed):  # with which no flag counts
-        return ["ns-train", method, "--load-config", str(checkpoints.parent / "config.yml")]
     if method not in typed:  # training was begun by something else than ns-train
         return ["ns-train", method, "--load-dir", str(checkpoints)]
     before, after = typed[: typed.index(method)], typed[typed.index(method) + 1 :]

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Optional
+from typing import Annotated, Literal, Optional, Tuple
 
 import tyro
 
@@ -18,14 +18,15 @@ EXAMPLES = {"html": "scene.html", "glb": "scene.glb"}
 class ExportOptions(CommandOptions):
     """Writes a stylised run as one file that needs no Python, and prints how close it comes to the exact render.
 
-    html is a page that shows the scene in any browser with WebGL2, without server or network: drag to turn, wheel or
-    pinch to zoom. It has at most 30 MB; if it would be larger, the scene gets fewer cells. splat is a PLY file of 3D
-    Gaussians, for viewers and editors of splats; glb has the same, or a mesh, as glTF. ply is a cloud of coloured
-    points. mesh is a PLY mesh with coloured vertices, made by Open3D's Poisson reconstruction.
+    html is a page that shows the scene in any browser with WebGL2, without server or network: a camera to move, a
+    flight, strength, geometry, before and after, and of two runs the styles between them. It has at most 30 MB; if it
+    would be larger, the scene gets fewer cells. splat is a PLY file of 3D Gaussians, for viewers and editors of splats;
+    glb has the same, or a mesh, as glTF. ply is a cloud of coloured points. mesh is a PLY mesh with coloured vertices,
+    made by Open3D's Poisson reconstruction.
     """
 
-    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The run's folder or its config.yml."""
+    runs: Annotated[Tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN]")]
+    """The run's folder or its config.yml. html: two styles of one coarse run make a page that blends them."""
     output_path: Path
     """The file to write."""
     format: Literal["html", "splat", "glb", "ply", "mesh"] = "html"
@@ -44,11 +45,15 @@ class ExportOptions(CommandOptions):
 
     def check(self) -> None:
         """Raises an `InputError` if there is no such run, or the file can't be written."""
+        if not 1 <= len(self.runs) <= (2 if self.format == "html" else 1):
+            many = "one run, or two styles of one scene" if self.format == "html" else "one run"
+            raise InputError(f"--format {self.format} takes {many}, not {len(self.runs)}.")
         if not 32 <= self.resolution <= 1023:
             raise InputError(f"--resolution {self.resolution} isn't between 32 and 1023; 255 suits most scenes.")
         if self.mesh and self.format != "glb":
             raise InputError("--mesh is for --format glb; for a mesh as PLY take --format mesh.")
         if self.max_splats is not None and self.max_splats < 1000:
             raise InputError(f"--max-splats {self.max_splats} shows no scene; give 1000 or more.")
-        find_config(self.run, STYLE_METHOD)
+        for run in self.runs:
+            find_config(run, STYLE_METHOD)
         prepare_output(self.output_path, "The scene", EXAMPLES.get(self.format, "scene.ply"), self.force)

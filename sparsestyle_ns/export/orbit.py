@@ -1,7 +1,7 @@
 """Cameras of the page: the training views as pinholes, and how far the user may turn away from the opening one.
 
 A turned camera is the opening one, first pitched about its own right axis and then yawed about the scene's up axis,
-both through a target on its line of sight. The page does the same (`turnedPose` in web_page.js).
+both through a target on its line of sight. The page does the same (`turnedPose` in cameras.js).
 """
 
 import math

@@ -1,17 +1,18 @@
-"""A stylised scene as bytes on a voxel grid: what a page carries, and how its renderer reads it.
+"""A stylised scene as bytes on voxel grids: what a page carries, and how its renderer reads it.
 
-σ_f and c_f depend on the position alone, so that a grid of them is the scene. The page's renderer (raymarch.frag) goes
-through it in even steps, as baked rendering does; `render_voxels` is that renderer in torch, by which the page's error
-against the exact render is measured.
+σ_c, σ_f and c_f depend on the position alone, and c_c hardly on more, so that grids of them are the scene, before and
+after, and all mixtures (`mixing`). The coarse field, an MLP of low frequencies, has half as many cells along a side.
+The page's renderer (raymarch.frag) goes through them in even steps, as baked rendering does; `render_voxels` is that
+renderer in torch, by which the page's error against the exact render is measured.
 """
 
 import copy
 import math
 from dataclasses import dataclass
-from typing import Iterator, Sequence
+from typing import Iterator, List, Sequence
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 from torch.nn import functional as F
@@ -19,8 +20,8 @@ from torch.nn import functional as F
 from sparsestyle_ns.core.occupancy import Occupancy, march
 from sparsestyle_ns.core.spaces import ForwardFacingSpace, Segments, Space
 from sparsestyle_ns.models.hier_style import HierStyleModel
-from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT, SIDE, BakedVolume, decode, encode, render_baked
-from sparsestyle_ns.rendering.mixing import Appearance, Mix, mixed
+from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT, SIDE, BakedVolume, render_baked
+from sparsestyle_ns.rendering.mixing import STYLISED, Appearance, Mix, mixed
 from sparsestyle_ns.rendering.render import render_packed
 from sparsestyle_ns.utils.device_sizes import sizes_for
 from sparsestyle_ns.utils.progress import track
@@ -30,21 +31,21 @@ EMPTY = 1
 ROUNDING = 0.05
 """Error of a graphics card's interpolation, in steps of a code: what is less than this above `EMPTY` is empty."""
 CELLS_PER_CALL = 1 << 16
+STYLE_CODES, COARSE_CODES = (1, 2, 3, 4), (0, 5, 6, 7)
+"""Of the eight codes of a baked volume (`Shade`), those of a stylised field and of the coarse one."""
 
 
 @dataclass
-class VoxelGrid:
-    """σ_f and c_f as bytes, on a grid of the cube whose borders are voxels too.
+class Voxels:
+    """σ and c of one field as bytes, on a grid of the cube whose borders are voxels too.
 
     Attributes:
-        codes: σ_f (coded as in `rendering/baked.py`) and c_f (of 255); `EMPTY` and black where nothing is known.
+        codes: σ (coded as in `rendering/baked.py`) and c (of 255); `EMPTY` and black where nothing is known.
         known: voxels that have values.
-        occupied: cells of a grid of its own in which samples count.
     """
 
     codes: UInt8[Tensor, "x y z 4"]
     known: Bool[Tensor, "x y z"]
-    occupied: Bool[Tensor, "u v w"]
 
     @property
     def resolution(self) -> int:
@@ -63,6 +64,24 @@ class VoxelGrid:
         return total
 
 
+@dataclass
+class VoxelGrid:
+    """Voxels of one or two styles, which know the same places, and of the coarse field that they have in common.
+
+    Attributes:
+        occupied: cells of a grid of its own in which samples count.
+    """
+
+    styles: List[Voxels]
+    coarse: Voxels
+    occupied: Bool[Tensor, "u v w"]
+
+    @property
+    def resolution(self) -> int:
+        """Cells along a side, of the styles."""
+        return self.styles[0].resolution
+
+
 def ray_segments(camera: Cameras, space: Space) -> Iterator[Segments]:
     """The segments of one camera's rays, row by row, some thousands at a time."""
     bundle = camera.generate_rays(camera_indices=0, keep_shape=False).flatten()
@@ -73,12 +92,13 @@ def ray_segments(camera: Cameras, space: Space) -> Iterator[Segments]:
 
 
 @torch.no_grad()
-def bake_voxels(model: HierStyleModel, resolution: int, cameras: Sequence[Cameras]) -> VoxelGrid:
-    """Evaluates a model's fields wherever some cameras may see them, mixed as the model's pictures show them.
+def bake_voxels(models: Sequence[HierStyleModel], resolution: int, cameras: Sequence[Cameras]) -> VoxelGrid:
+    """Evaluates the fields of one or two models with one coarse field, wherever some cameras may see them.
 
     These are the cells that aren't empty, in bricks of 8³ that the cameras' rays reach before 99.9% of the light is
     gone. A ray is cast for each pixel, so a brick should be some pixels wide.
     """
+    model = models[0]
     volume = model.bake(resolution)
     for camera in track(cameras, "Finding what can be seen"):
         for segments in ray_segments(camera.to(model.device), model.space):
@@ -91,21 +111,26 @@ def bake_voxels(model: HierStyleModel, resolution: int, cameras: Sequence[Camera
         seen = seen.repeat_interleave(SIDE, dim=axis).narrow(axis, 0, resolution)
     occupied = F.adaptive_max_pool3d(filled.float()[None], resolution)[0] > 0
     cells = seen & (occupied | last_step_cells(model, resolution))
+    half = -(-resolution // 2)
+    fewer_cells = F.adaptive_max_pool3d(cells.float()[None], half)[0] > 0
+    styles = [volume, *(other.bake(resolution) for other in models[1:])]
+    return VoxelGrid(
+        [fill_voxels(each, cells, STYLE_CODES) for each in styles],
+        fill_voxels(model.bake(half), fewer_cells, COARSE_CODES),
+        filled.cpu(),
+    )
+
+
+def fill_voxels(volume: BakedVolume, cells: Bool[Tensor, "x y z"], chosen: Sequence[int]) -> Voxels:
+    """The voxels at the corners of cells, with four of a volume's eight codes: a density, and a colour."""
     for part in track(cells.nonzero().split(CELLS_PER_CALL), "Baking"):
         volume.fill(part)
     known = F.max_pool3d(F.pad(cells.float()[None], (1,) * 6), kernel_size=2, stride=1)[0] > 0
     codes = torch.zeros(*known.shape, 4, dtype=torch.uint8, device=known.device)
     codes[..., 0] = EMPTY
     index = known.nonzero()
-    codes[known] = torch.cat([shown_codes(volume, part, model.display.own.mix) for part in index.split(CELLS_PER_CALL)])
-    return VoxelGrid(codes.cpu(), known.cpu(), filled.cpu())
-
-
-def shown_codes(volume: BakedVolume, voxels: Int[Tensor, "voxels 3"], mix: Mix) -> UInt8[Tensor, "voxels 4"]:
-    """Codes of the density and colour that a mixture of the fields shows: by default those of σ_f and c_f."""
-    values = decode(volume.codes.view(-1, 8)[volume.rows(voxels)].float())
-    density, color = mixed(Appearance(values[:, 0], values[:, 5:]), [Appearance(values[:, 1], values[:, 2:5])], mix)
-    return encode(torch.cat([density[:, None], density[:, None], color, color], dim=-1))[:, 1:5]
+    codes[known] = volume.codes.view(-1, 8)[volume.rows(index)][:, list(chosen)]
+    return Voxels(codes.cpu(), known.cpu())
 
 
 def last_step_cells(model: HierStyleModel, resolution: int) -> Bool[Tensor, "x y z"]:
@@ -120,20 +145,32 @@ def last_step_cells(model: HierStyleModel, resolution: int) -> Bool[Tensor, "x y
 
 
 @torch.no_grad()
-def picture_of_voxels(voxels: VoxelGrid, model: HierStyleModel, camera: Cameras) -> Float[Tensor, "H W 3"]:
+def picture_of_voxels(
+    voxels: VoxelGrid, model: HierStyleModel, camera: Cameras, mix: Mix = STYLISED
+) -> Float[Tensor, "H W 3"]:
     """What the page shows of one camera, worked out in torch on the CPU."""
-    colors = [render_voxels(voxels, part, model) for part in ray_segments(camera, copy.deepcopy(model.space).cpu())]
+    parts = ray_segments(camera, copy.deepcopy(model.space).cpu())
+    colors = [render_voxels(voxels, part, model, mix) for part in parts]
     return torch.cat(colors).view(int(camera.height), int(camera.width), 3)
 
 
 @torch.no_grad()
-def render_voxels(voxels: VoxelGrid, segments: Segments, model: HierStyleModel) -> Float[Tensor, "rays 3"]:
+def render_voxels(
+    voxels: VoxelGrid, segments: Segments, model: HierStyleModel, mix: Mix = STYLISED
+) -> Float[Tensor, "rays 3"]:
     """What the page shows on each ray, on the CPU; of the model it takes how it marches, and the background."""
     occupancy = Occupancy(len(voxels.occupied))
     occupancy.occupied = voxels.occupied
     samples = march(segments, occupancy, model.config.num_steps, model.space.unbounded)
-    values = voxels.interpolate(samples.positions)
+    coarse, *styles = (appearance(each, samples.positions) for each in (voxels.coarse, *voxels.styles))
+    density, color = mixed(coarse, styles, mix)
+    background = None if model.background is None else model.background.cpu()
+    return render_packed(samples, len(segments.hit), density, color, background).rgb
+
+
+def appearance(voxels: Voxels, positions: Float[Tensor, "points 3"]) -> Appearance:
+    """σ and c between voxels."""
+    values = voxels.interpolate(positions)
     steps = values[:, 0] - EMPTY
     density = torch.where(steps > ROUNDING, DENSITY_UNIT * torch.expm1(DENSITY_STEP * steps), 0.0)
-    background = None if model.background is None else model.background.cpu()
-    return render_packed(samples, len(segments.hit), density, values[:, 1:] / 255.0, background).rgb
+    return Appearance(density, values[:, 1:] / 255.0)

@@ -1,28 +1,32 @@
-"""The exported page: one HTML file with the voxels of a stylised scene and the shader that shows them.
+"""The exported page: one HTML file with the voxels of one or two styles of a scene and the shader that shows them.
 
-The voxels lie in it as base64 of gzip of: the occupancy's bits, the bits of the voxels that have values, and of those
-voxels four planes of bytes: density, red, green, blue. Bits are packed from the lowest; both grids have z as their
-fastest axis; each byte of a plane is the difference, modulo 256, from the one before.
+The voxels lie in it as base64 of gzip of: the occupancy's bits, the bits of the styles' voxels that have values and the
+same of the coarse field's, and then, of those voxels, four planes of bytes for each style and for the coarse field:
+density, red, green, blue. Bits are packed from the lowest; all grids have z as their fastest axis; each byte of a plane
+is the difference, modulo 256, from the one before. From a second style's density the first one's is taken before.
 """
 
 import base64
 import gzip
 from pathlib import Path
-from typing import Callable, Dict, Tuple
+from typing import Callable, Dict, List, Sequence, Tuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sparsestyle_ns.core.camera_paths import most_central
+from sparsestyle_ns.core.camera_paths import most_central, showing_path
 from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace, Space
 from sparsestyle_ns.evaluation.held_out import MIN_ACCUMULATION
 from sparsestyle_ns.export.orbit import Orbit, make_orbit, pinholes, survey
 from sparsestyle_ns.export.stylised_scene import StylisedScene, exact_pictures
-from sparsestyle_ns.export.voxel_grid import EMPTY, ROUNDING, VoxelGrid, bake_voxels, picture_of_voxels
+from sparsestyle_ns.export.voxel_grid import EMPTY, ROUNDING, VoxelGrid, Voxels, bake_voxels, picture_of_voxels
 from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT
+from sparsestyle_ns.rendering.mixing import Mix
+from sparsestyle_ns.runs.scene_record import in_words
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_output
 from sparsestyle_ns.utils.page import render_page
@@ -31,32 +35,51 @@ COMPARED_SIDE = 252
 """Pixels along the longer side of the pictures by which a page is measured, at most."""
 MAX_BYTES = 30_000_000
 """Size that a page may have, so that it can be sent by e-mail and opened on a telephone."""
+FLIGHT_POSES = 120
+"""Of the path that the page plays; it goes evenly from one to the next."""
 LEAST_RESOLUTION = 32
 """With fewer cells along a side a page shows no scene any more."""
 
 
-def export_page(scene: StylisedScene, output_path: Path, resolution: int) -> None:
-    """Writes the page, and prints its size and its error against the exact render; `InputError` if it doesn't fit.
+def export_page(scenes: Sequence[StylisedScene], output_path: Path, resolution: int) -> None:
+    """Writes the page of one or two styles, and prints its size and error; `InputError` if it doesn't fit.
 
-    It has `resolution` cells along a side of the cube, or fewer if it gets too large.
+    It has `resolution` cells along a side of the cube, or fewer if it gets too large. The error is that against the
+    exact render of the training views.
     """
-    model, cameras = scene.model, scene.cameras
-    exact = exact_pictures(scene, COMPARED_SIDE)
+    scene, cameras = scenes[0], scenes[0].cameras
+    exact = [exact_pictures(each, COMPARED_SIDE) for each in scenes]
     opening = most_central(cameras)
-    orbit = make_orbit(model.space, cameras, opening, median_depth(exact[opening]))
+    orbit = make_orbit(scene.model.space, cameras, opening, median_depth(exact[0][opening]))
     views = survey(orbit, cameras)
     voxels, page = fit_page(
-        lambda cells: bake_voxels(model, cells, views), lambda voxels: build_page(voxels, scene, orbit), resolution
+        lambda cells: bake_voxels([each.model for each in scenes], cells, views),
+        lambda voxels: build_page(voxels, scenes, orbit),
+        resolution,
     )
     write_output(output_path, page, "The page", "scene.html")
     print(f"{voxels.resolution} cells along a side, {len(page) / 1e6:.1f} MB")
-    errors = []
-    for index, (name, picture) in enumerate(zip(scene.names, exact, strict=True)):
-        shown = picture_of_voxels(voxels, model, pinholes(cameras[index : index + 1], COMPARED_SIDE))
-        errors.append(psnr(shown, picture["rgb"]))
-        print(f"PSNR to the exact render, view of {name}: {errors[-1]:.1f} dB")
-    height, width = exact[0]["rgb"].shape[:2]
-    print(f"Mean of the training views at {width} × {height}: {sum(errors) / len(errors):.1f} dB")
+    for blend, (style, pictures) in enumerate(zip(scenes, exact, strict=True)):
+        mix = style.model.display.own.mix._replace(blend=float(blend))
+        errors = errors_of_voxels(voxels, scene, mix, [picture["rgb"] for picture in pictures])
+        for name, error in zip(scene.names, errors, strict=True):
+            print(f"PSNR to the exact render, view of {name}: {error:.1f} dB")
+        height, width = pictures[0]["rgb"].shape[:2]
+        where = f"the training views at {width} × {height}"
+        print(f"Mean of {where}{f', {style.style}' if len(scenes) > 1 else ''}: {sum(errors) / len(errors):.1f} dB")
+    before = errors_of_voxels(voxels, scene, Mix(0.0), [picture["rgb_coarse"] for picture in exact[0]])
+    print(f"The same of the coarse field, at strength 0: {sum(before) / len(before):.1f} dB")
+
+
+def errors_of_voxels(
+    voxels: VoxelGrid, scene: StylisedScene, mix: Mix, exact: Sequence[Float[Tensor, "H W 3"]]
+) -> List[float]:
+    """PSNR of the page's pictures of the training views against exact ones, in dB."""
+    views = (pinholes(scene.cameras[index : index + 1], COMPARED_SIDE) for index in range(len(exact)))
+    return [
+        psnr(picture_of_voxels(voxels, scene.model, view, mix), picture)
+        for view, picture in zip(views, exact, strict=True)
+    ]
 
 
 def median_depth(picture: Dict[str, Tensor]) -> float:
@@ -91,27 +114,46 @@ def fit_page(
         resolution = smaller
 
 
-def build_page(voxels: VoxelGrid, scene: StylisedScene, orbit: Orbit) -> bytes:
-    """The page's HTML, for a scene and its voxels."""
-    model, cameras = scene.model, scene.cameras
+def build_page(voxels: VoxelGrid, scenes: Sequence[StylisedScene], orbit: Orbit) -> bytes:
+    """The page's HTML, for one or two styles of a scene and their voxels."""
+    scene, model, cameras = scenes[0], scenes[0].model, scenes[0].cameras
     background = torch.zeros(3) if model.background is None else model.background
+    mix = model.display.own.mix
+    title = " and ".join(filter(None, [scene.title, *(other.style for other in scenes[1:])]))
     described = {
-        "resolution": voxels.resolution,
+        "file_name": f"{title}.png",
+        "styles": [{"name": each.style or each.method, **describe_voxels(voxels.styles[0])} for each in scenes],
+        "coarse": describe_voxels(voxels.coarse),
         "cells": len(voxels.occupied),
-        "known": int(voxels.known.sum()),
         "num_steps": model.config.num_steps,
+        "mix": {"strength": mix.strength, "geometry": mix.geometry, "blend": mix.blend},
         "background": background.tolist(),
         "density": {"unit": DENSITY_UNIT, "step": DENSITY_STEP, "empty": EMPTY, "rounding": ROUNDING},
         "space": describe_space(model.space),
         "cameras": [describe_camera(cameras[index], name) for index, name in enumerate(scene.names)],
         "orbit": {**vars(orbit), "target": orbit.target.tolist(), "up": orbit.up.tolist()},
+        "flight": showing_path(cameras, FLIGHT_POSES).camera_to_worlds.tolist() if len(cameras) > 1 else [],
     }
     packed = base64.b64encode(pack(voxels)).decode()
-    return render_page("web_page.html", __package__, title=scene.title, scene=described, voxels=packed).encode()
+    captions = [caption(each) for each in scenes]
+    told = {"title": title, "captions": captions, "scene": described, "voxels": packed}
+    return render_page("web_page.html", __package__, **told).encode()
+
+
+def caption(scene: StylisedScene) -> str:
+    """What made a stylised scene, in a line."""
+    painting = "a painting that isn't known" if scene.painting is None else scene.painting
+    photos = f"{len(scene.names)} photo{'s' if len(scene.names) > 1 else ''} ({in_words(scene.names)})"
+    return f"{scene.name} from {photos}, painted like {painting} by {scene.method} in {scene.iterations} iterations"
+
+
+def describe_voxels(voxels: Voxels) -> Dict[str, int]:
+    """How many voxels a field has, in the words of voxels.js."""
+    return {"resolution": voxels.resolution, "known": int(voxels.known.sum())}
 
 
 def describe_space(space: Space) -> Dict[str, object]:
-    """A space in the words of web_page.js; what it has no use for is 0."""
+    """A space in the words of renderer.js; what it has no use for is 0."""
     kind = {ForwardFacingSpace: "ndc", BoxSpace: "box", ContractedSpace: "contracted"}[type(space)]
     told = {"kind": kind, "unbounded": space.unbounded, "near": space.near, "unit": getattr(space, "unit", 1.0)}
     told |= {key: getattr(space, key, torch.zeros(3)).tolist() for key in ("minimum", "maximum")}
@@ -123,15 +165,18 @@ def describe_space(space: Space) -> Dict[str, object]:
 
 
 def describe_camera(camera: Cameras, name: str) -> Dict[str, object]:
-    """One pinhole camera in the words of web_page.js."""
+    """One pinhole camera in the words of cameras.js."""
     numbers = {key: float(getattr(camera, key)) for key in ("fx", "fy", "cx", "cy", "width", "height")}
     return {"name": name, "pose": camera.camera_to_worlds.tolist(), **numbers}
 
 
 def pack(voxels: VoxelGrid) -> bytes:
     """Voxels in the page's layout, compressed."""
-    bits = [np.packbits(grid.numpy(), bitorder="little").tobytes() for grid in (voxels.occupied, voxels.known)]
-    planes = voxels.codes[voxels.known].T.contiguous().numpy()
-    steps = np.diff(planes, axis=1, prepend=np.uint8(0))  # bytes wrap around
+    grids = (voxels.occupied, voxels.styles[0].known, voxels.coarse.known)
+    bits = [np.packbits(grid.numpy(), bitorder="little").tobytes() for grid in grids]
+    planes = [each.codes[each.known].T.numpy() for each in (*voxels.styles, voxels.coarse)]
+    for other in planes[1 : len(voxels.styles)]:
+        other[0] -= planes[0][0]  # bytes wrap around, here and below
+    steps = [np.diff(each, axis=1, prepend=np.uint8(0)).tobytes() for each in planes]
     # Level 9 saves 0.1%. Without a time in it, the same scene gives the same file.
-    return gzip.compress(b"".join([*bits, steps.tobytes()]), compresslevel=6, mtime=0)
+    return gzip.compress(b"".join([*bits, *steps]), compresslevel=6, mtime=0)

@@ -3,10 +3,14 @@
 from typing import NamedTuple
 
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from sparsestyle_ns.core.spaces import MAX_DISTANCE
 from sparsestyle_ns.core.volrend import MAX_OPTICAL_DEPTH
-from sparsestyle_ns.utils.numba_kernels import kernel
+from sparsestyle_ns.utils.numba_kernels import inlined, kernel
 
 LOOKAHEAD = 6
 """Samples of a ray that may turn out to be missing before the ray waits for them."""
@@ -21,7 +25,9 @@ _ENDLESS, _FARTHEST = np.float32(np.inf), np.float32(1e6)
 _CAREFUL = np.float32(2 * 0.999)  # the cube's side, but for rounding
 _LEAST_DISPARITY = np.float32(0.5 / MAX_DISTANCE)
 _BYTE, _NO_BYTE = np.uint64(255), np.uint64(0)
-_BITS_8, _BITS_16, _BITS_24, _BITS_32, _BITS_40, _BITS_48, _BITS_56 = (np.uint64(8 * byte) for byte in range(1, 8))
+_LOG2_E, _LN2_HIGH, _LN2_LOW = np.float32(1.4426950), np.float32(0.693359375), np.float32(-2.1219444e-4)
+_TERMS = tuple(np.float32(1.0 / factorial) for factorial in (2, 6, 24, 120, 720))
+_BIAS, _MANTISSA = np.int32(127), np.int32(23)  # of a float32's exponent; and bits below it
 
 
 class Lines(NamedTuple):
@@ -56,10 +62,9 @@ class Voxels(NamedTuple):
     rounding: np.float32
 
 
-@kernel
-def _point(lines, ray, s):
-    """Field coordinates at s."""
-    line = lines.values[ray]
+@inlined
+def _point(lines, line, s):
+    """Field coordinates at s of a ray, given by its six numbers."""
     if not lines.bent:
         return line[0] + s * line[3], line[1] + s * line[4], line[2] + s * line[5]
     spaced = lines.spaced[0] + s * lines.spaced[1]
@@ -70,28 +75,29 @@ def _point(lines, ray, s):
     return x * scale, y * scale, z * scale
 
 
-@kernel
-def _length(lines, ray, sample):
+@inlined
+def _length(lines, line, sample):
     """δ of a sample, in field coordinates."""
-    x0, y0, z0 = _point(lines, ray, lines.edges[sample])
-    x1, y1, z1 = _point(lines, ray, lines.edges[sample + 1])
+    x0, y0, z0 = _point(lines, line, lines.edges[sample])
+    x1, y1, z1 = _point(lines, line, lines.edges[sample + 1])
     x, y, z = x1 - x0, y1 - y0, z1 - z0
     return np.sqrt(x * x + y * y + z * z)
 
 
-@kernel
+@inlined
 def _scaled(coordinate, size):
     """Where a coordinate lies on an axis of `size` units; outside of the cube (and for NaN) at its border."""
     share = _HALF * coordinate + _HALF
     return np.float32(size) * (min(share, _ONE) if share > _ZERO else _ZERO)
 
 
-@kernel
+@inlined
 def _empty_steps(clearance, x, y, z, length):
     """How many steps of a length, from this point on, surely lie in empty cells; 0 in an occupied one."""
     size = clearance.shape[0]
-    i, j, k = int(_scaled(x, size)), int(_scaled(y, size)), int(_scaled(z, size))
-    cells = clearance[min(i, size - 1), min(j, size - 1), min(k, size - 1)]
+    last = np.uint32(size - 1)
+    i, j, k = np.uint32(_scaled(x, size)), np.uint32(_scaled(y, size)), np.uint32(_scaled(z, size))
+    cells = clearance[np.uintp(min(i, last)), np.uintp(min(j, last)), np.uintp(min(k, last))]
     if cells <= 1:
         return int(cells)
     # From any point of a cell it is a cell less to the nearest occupied one.
@@ -99,7 +105,17 @@ def _empty_steps(clearance, x, y, z, length):
     return 1 + int(leap) if leap < _FARTHEST else 1  # no number passes neither
 
 
-@kernel
+@inlined
+def _slot(slots, i, j, k):
+    return slots[np.uintp(i), np.uintp(j), np.uintp(k)]  # without a sign, an index isn't asked whether it is negative
+
+
+@inlined
+def _word(words, slot, place):
+    return words[np.uintp(slot), np.uintp(place)]
+
+
+@inlined
 def _words(voxels, i, j, k):
     """The eight corners of a cell, from (0, 0, 0), (0, 0, 1) … to (1, 1, 1)."""
     slots, words = voxels.slots, voxels.words
@@ -107,31 +123,31 @@ def _words(voxels, i, j, k):
     i1, j1, k1 = i + 1, j + 1, k + 1
     x1, y1, z1 = (i1 & 6) << 6 | (i1 & 1) << 2, (j1 & 6) << 4 | (j1 & 1) << 1, (k1 & 6) << 2 | (k1 & 1)
     i, j, k, i1, j1, k1 = i >> 3, j >> 3, k >> 3, i1 >> 3, j1 >> 3, k1 >> 3
-    slot = slots[i, j, k]
+    slot = _slot(slots, i, j, k)
     if i == i1 and j == j1 and k == k1:  # two cells in three
         return (
-            words[slot, x0 | y0 | z0],
-            words[slot, x0 | y0 | z1],
-            words[slot, x0 | y1 | z0],
-            words[slot, x0 | y1 | z1],
-            words[slot, x1 | y0 | z0],
-            words[slot, x1 | y0 | z1],
-            words[slot, x1 | y1 | z0],
-            words[slot, x1 | y1 | z1],
+            _word(words, slot, x0 | y0 | z0),
+            _word(words, slot, x0 | y0 | z1),
+            _word(words, slot, x0 | y1 | z0),
+            _word(words, slot, x0 | y1 | z1),
+            _word(words, slot, x1 | y0 | z0),
+            _word(words, slot, x1 | y0 | z1),
+            _word(words, slot, x1 | y1 | z0),
+            _word(words, slot, x1 | y1 | z1),
         )
     return (
-        words[slot, x0 | y0 | z0],
-        words[slots[i, j, k1], x0 | y0 | z1],
-        words[slots[i, j1, k], x0 | y1 | z0],
-        words[slots[i, j1, k1], x0 | y1 | z1],
-        words[slots[i1, j, k], x1 | y0 | z0],
-        words[slots[i1, j, k1], x1 | y0 | z1],
-        words[slots[i1, j1, k], x1 | y1 | z0],
-        words[slots[i1, j1, k1], x1 | y1 | z1],
+        _word(words, slot, x0 | y0 | z0),
+        _word(words, _slot(slots, i, j, k1), x0 | y0 | z1),
+        _word(words, _slot(slots, i, j1, k), x0 | y1 | z0),
+        _word(words, _slot(slots, i, j1, k1), x0 | y1 | z1),
+        _word(words, _slot(slots, i1, j, k), x1 | y0 | z0),
+        _word(words, _slot(slots, i1, j, k1), x1 | y0 | z1),
+        _word(words, _slot(slots, i1, j1, k), x1 | y1 | z0),
+        _word(words, _slot(slots, i1, j1, k1), x1 | y1 | z1),
     )
 
 
-@kernel
+@inlined
 def _corner_weights(fx, fy, fz):
     gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
     return (
@@ -146,50 +162,72 @@ def _corner_weights(fx, fy, fz):
     )
 
 
-@kernel
-def _densities(words, weights):
-    """Whether all corners are known, and the trilinear means of their first two bytes, the densities' codes."""
-    known, a, b = True, _ZERO, _ZERO
+@inlined
+def _are_known(words):
+    """Whether all corners have been evaluated."""
+    known = True
     for corner in range(8):
-        weight, word = weights[corner], words[corner]
-        known &= (word & _BYTE) != _NO_BYTE
-        a += weight * np.float32(word & _BYTE)
-        b += weight * np.float32(word >> _BITS_8 & _BYTE)
-    return known, a, b
+        known &= (words[corner] & _BYTE) != _NO_BYTE
+    return known
 
 
-@kernel
-def _colors(words, weights):
-    """The trilinear means of the corners' other six bytes: the style's colour and the coarse one."""
-    c, d, e, f, g, h = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
-    for corner in range(8):
-        weight, word = weights[corner], words[corner]
-        c += weight * np.float32(word >> _BITS_16 & _BYTE)
-        d += weight * np.float32(word >> _BITS_24 & _BYTE)
-        e += weight * np.float32(word >> _BITS_32 & _BYTE)
-        f += weight * np.float32(word >> _BITS_40 & _BYTE)
-        g += weight * np.float32(word >> _BITS_48 & _BYTE)
-        h += weight * np.float32(word >> _BITS_56)
-    return c, d, e, f, g, h
+@intrinsic
+def _mean(typing_context, words, weights):
+    """The trilinear means of the corners' eight bytes: codes of both densities, the style's colour, the coarse one.
+
+    In vectors of eight numbers, which the compiler doesn't find by itself, and added up in pairs: a sample's light has
+    to wait for these sums.
+    """
+
+    def generate(context, builder, signature, arguments):
+        corners = [cgutils.unpack_tuple(builder, argument, 8) for argument in arguments]
+        vector, index = ir.VectorType(ir.FloatType(), 8), ir.IntType(32)
+        unset, firsts = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(index, 8), [0] * 8)
+        parts = []
+        for word, weight in zip(*corners, strict=True):
+            codes = builder.uitofp(builder.bitcast(word, ir.VectorType(ir.IntType(8), 8)), vector)
+            weight = builder.shuffle_vector(builder.insert_element(unset, weight, index(0)), unset, firsts)
+            parts.append(builder.fmul(codes, weight, flags=("contract",)))
+        while len(parts) > 1:
+            pairs = zip(parts[::2], parts[1::2], strict=True)
+            parts = [builder.fadd(first, second, flags=("contract",)) for first, second in pairs]
+        means = [builder.extract_element(parts[0], index(place)) for place in range(8)]
+        return context.make_tuple(builder, signature.return_type, means)
+
+    return types.UniTuple(types.float32, 8)(words, weights), generate
 
 
-@kernel
+@inlined
+def _exp(x):
+    """e^x for x from -87 to 88, to 3e-7 of it: a polynomial of what is left of a power of 2 (Cody and Waite 1980)."""
+    power = np.floor(x * _LOG2_E + _HALF)
+    rest = (x - power * _LN2_HIGH) - power * _LN2_LOW
+    square = rest * rest
+    series = (
+        _ONE
+        + rest
+        + square * (_TERMS[0] + rest * _TERMS[1] + square * (_TERMS[2] + rest * _TERMS[3] + square * _TERMS[4]))
+    )
+    return series * np.int32((np.int32(power) + _BIAS) << _MANTISSA).view(np.float32)
+
+
+@inlined
 def _density(voxels, code):
     """The density that has this code."""
     if code - _ONE <= voxels.rounding:
         return _ZERO
-    return voxels.unit * (np.exp(voxels.step * (code - _ONE)) - _ONE)
+    return voxels.unit * (_exp(voxels.step * (code - _ONE)) - _ONE)
 
 
-@kernel
+@inlined
 def _transmitted(density, length, infinite):
     """exp(−τ) of a sample."""
     if density <= _ZERO:
         return _ONE
-    return np.exp(-_DEPTH_CAP if infinite else -min(density * length, _DEPTH_CAP))
+    return _exp(-_DEPTH_CAP if infinite else -min(density * length, _DEPTH_CAP))
 
 
-@kernel
+@inlined
 def _between(first, second, share):
     """From the first at a share of 0 to the second at 1, exactly at both."""
     return (_ONE - share) * first + share * second
@@ -207,23 +245,26 @@ def march_rays(rays, start, end, lines, voxels, second, shares, min_transmittanc
             corner's index among all voxels. A ray that has any has to be marched again.
     """
     last, top = len(lines.edges) - 2, voxels.resolution
+    middles = _HALF * (lines.edges[1:] + lines.edges[:-1])
     density_share, color_share, blend = shares
     for place in range(start, end):
         ray = rays[place]
         if not lines.hit[ray]:
             continue
+        values = lines.values[ray]
+        line = values[0], values[1], values[2], values[3], values[4], values[5]
         lacking = 0
         r, g, b, opacity, moment = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
         coarse_r, coarse_g, coarse_b, coarse_opacity, coarse_moment = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
         light, coarse_light = _ONE, _ONE
-        length = _length(lines, ray, 0)
+        length = _length(lines, line, 0)
         following = 0
         while following <= last:
             sample, following = following, following + 1
             if coarse_light <= min_transmittance or lacking == LOOKAHEAD:
                 break
-            s = _HALF * (lines.edges[sample] + lines.edges[sample + 1])
-            x, y, z = _point(lines, ray, s)
+            s = middles[sample]
+            x, y, z = _point(lines, line, s)
             infinite = lines.unbounded and sample == last
             if not infinite:
                 empty = _empty_steps(voxels.clearance, x, y, z, _ENDLESS if lines.bent else length)
@@ -236,20 +277,21 @@ def march_rays(rays, start, end, lines, voxels, second, shares, min_transmittanc
             i, j, k = min(int(u), top - 1), min(int(v), top - 1), min(int(w), top - 1)
             fu, fv, fw = u - np.float32(i), v - np.float32(j), w - np.float32(k)
             words, near = _words(voxels, i, j, k), _corner_weights(fu, fv, fw)
-            known, code, style_code = _densities(words, near)
+            known, mean = _are_known(words), _mean(words, near)
+            code, style_code = mean[0], mean[1]
             density = _density(voxels, code)
             style_density = density if style_code == code else _density(voxels, style_code)
             if second is not None:
                 second_words = _words(second, i, j, k)
-                both, _, other_code = _densities(second_words, near)
-                known &= both
-                style_density = _between(style_density, _density(second, other_code), blend)
+                known &= _are_known(second_words)
+                other = _mean(second_words, near)
+                style_density = _between(style_density, _density(second, other[1]), blend)
             if not known:
                 missing[place, lacking] = (i * top + j) * top + k
                 lacking += 1
                 continue
             if lines.bent:
-                length = _length(lines, ray, sample)
+                length = _length(lines, line, sample)
             left = _transmitted(density, length, infinite)
             coarse_weight = coarse_light * (_ONE - left)
             coarse_light *= left
@@ -263,12 +305,11 @@ def march_rays(rays, start, end, lines, voxels, second, shares, min_transmittanc
             moment += weight * s
             if max(coarse_weight, weight) < _UNSEEN:
                 continue
-            style_r, style_g, style_b, own_r, own_g, own_b = _colors(words, near)
+            style_r, style_g, style_b, own_r, own_g, own_b = mean[2:]
             if second is not None:
-                other = _colors(second_words, near)
-                style_r = _between(style_r, other[0], blend)
-                style_g = _between(style_g, other[1], blend)
-                style_b = _between(style_b, other[2], blend)
+                style_r = _between(style_r, other[2], blend)
+                style_g = _between(style_g, other[3], blend)
+                style_b = _between(style_b, other[4], blend)
             coarse_r += coarse_weight * own_r
             coarse_g += coarse_weight * own_g
             coarse_b += coarse_weight * own_b

@@ -24,6 +24,11 @@ def kernel(function: Callable[..., None]) -> Callable[..., None]:
         return numba.njit(**options)(function)
 
 
+def inlined(function: Callable[..., R]) -> Callable[..., R]:
+    """Compiles a part of a kernel into whatever calls it: a call would hand over each array as a handful of numbers."""
+    return numba.njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)(function)
+
+
 def run_on_threads(function: Callable[..., None], parts: Sequence[Tuple]) -> None:
     """Calls `function(*part)` for each part, on as many threads as torch uses; an error in one is raised here."""
     threads = min(torch.get_num_threads(), len(parts))

@@ -4,10 +4,14 @@ import math
 from typing import Any, Callable, List
 
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.viewer import render_state_machine
+from nerfstudio.viewer.utils import get_camera
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from viser import ClientHandle
 
 from sparsestyle_ns.core.camera_paths import most_central
+from sparsestyle_ns.core.pinhole import pinhole_rays
 
 
 def begin_at_central_photo(viewer: Viewer, cameras: Cameras) -> None:
@@ -49,3 +53,26 @@ def keep_outputs(viewer: Viewer, outputs: List[str], choose: Callable[[], None])
 
     control_panel.update_output_options = fill_and_choose
     fill_and_choose(outputs)
+
+
+class ViewerCamera(Cameras):
+    """The camera of a picture in the viewer; its rays are quick to make, and kept: its depth map needs them too."""
+
+    def generate_rays(self, camera_indices: Any, **settings: Any) -> RayBundle:
+        """The rays of all its pixels; nerfstudio's own where there is a crop or the camera is no pinhole."""
+        if settings.get("obb_box") is not None:
+            return super().generate_rays(camera_indices, **settings)
+        if "rays" not in self.__dict__:
+            self.__dict__["rays"] = pinhole_rays(self) or super().generate_rays(camera_indices, **settings)
+        return self.__dict__["rays"]
+
+
+def make_rays_once() -> None:
+    """Has nerfstudio's viewer take its pictures with a `ViewerCamera`."""
+
+    def viewer_camera(*arguments: Any, **named: Any) -> ViewerCamera:
+        camera = get_camera(*arguments, **named)
+        camera.__class__ = ViewerCamera
+        return camera
+
+    render_state_machine.get_camera = viewer_camera

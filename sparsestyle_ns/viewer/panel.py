@@ -22,9 +22,10 @@ from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes
 from sparsestyle_ns.runs.scene_record import find_thumbnail
 from sparsestyle_ns.utils.files import free_name
-from sparsestyle_ns.viewer.adjustments import begin_at_central_photo, hide_frustums, keep_outputs
+from sparsestyle_ns.viewer.adjustments import begin_at_central_photo, hide_frustums, keep_outputs, make_rays_once
 from sparsestyle_ns.viewer.baking import Baker
 from sparsestyle_ns.viewer.restyling_controls import Pace, RestylingControls, losses_text
+from sparsestyle_ns.viewer.splat_controls import SplatControls
 from sparsestyle_ns.viewer.styles import Facts, Style, plain, saved_notes, style_facts
 
 NO_BLEND = "nothing"
@@ -62,6 +63,7 @@ class StylePanel(ViewerControl):
         self.describe_run()
         keep_outputs(viewer, OUTPUTS, self.apply_split)
         hide_frustums(viewer)
+        make_rays_once()
         cameras = self.pipeline.datamanager.train_dataset.cameras
         begin_at_central_photo(viewer, cameras)
         self.pipeline.model.display.viewer = self.look
@@ -99,6 +101,8 @@ class StylePanel(ViewerControl):
             self.seconds_at_rest,
             self.add_style,
         )
+        with gui.add_folder("Splats", expand_by_default=False):
+            self.splats = SplatControls(self.viewer.viser_server, self.folder)
         with gui.add_folder("What made it"):
             self.description = gui.add_markdown("", image_root=Path())
         add_effects(self.viewer, self.pipeline)

@@ -9,7 +9,8 @@ from nerfstudio.data.scene_box import SceneBox
 
 from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace
 from sparsestyle_ns.export.orbit import Orbit, make_orbit
-from sparsestyle_ns.export.voxel_grid import EMPTY, VoxelGrid
+from sparsestyle_ns.export.voxel_grid import EMPTY, VoxelGrid, Voxels
+from sparsestyle_ns.rendering.mixing import STYLISED
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 NUM_STEPS = 48
@@ -32,30 +33,43 @@ def look_ahead(*places) -> Cameras:
     return Cameras(poses, fx=FOCAL, fy=FOCAL, cx=32.0, cy=24.0, width=WIDTH, height=HEIGHT)
 
 
-def balls(resolution: int, cells: int) -> VoxelGrid:
-    """Two coloured balls, soft at the edge, in a thin fog; cells away from them are empty."""
+def balls(resolution: int, cells: int, styles: int = 1) -> VoxelGrid:
+    """Two coloured balls, soft at the edge, in a thin fog; cells away from them are empty.
 
-    def distances(points):
-        centers = torch.tensor([[-0.35, 0.1, 0.0], [0.4, -0.2, 0.15]])
-        return (points[..., None, :] - centers).norm(dim=-1)
+    In the second style they have other colours and one is larger, in the coarse field they are grey and one is smaller.
+    """
+    middle = (torch.arange(cells) + 0.5) * (2.0 / cells) - 1.0
+    at = torch.stack(torch.meshgrid(middle, middle, middle, indexing="ij"), dim=-1)
+    coarse = ball_voxels(-(-resolution // 2), 0.25, lambda points: 0.4 + 0.3 * points.sum(dim=-1, keepdim=True).sin())
+    voxels = [
+        ball_voxels(resolution, 0.3, lambda points: 0.5 + 0.5 * torch.sin(6.0 * points)),
+        ball_voxels(resolution, 0.4, lambda points: 0.5 + 0.5 * torch.cos(4.0 * points.flip(-1))),
+    ]
+    return VoxelGrid(voxels[:styles], coarse, distances(at).amin(dim=-1) < 0.6)
 
+
+def distances(points):
+    """From the middles of the two balls."""
+    centers = torch.tensor([[-0.35, 0.1, 0.0], [0.4, -0.2, 0.15]])
+    return (points[..., None, :] - centers).norm(dim=-1)
+
+
+def ball_voxels(resolution, radius, shade) -> Voxels:
+    """The balls in one field."""
     axis = torch.linspace(-1.0, 1.0, resolution + 1)
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
     first, second = distances(points).unbind(-1)
-    code = EMPTY + 170.0 * torch.sigmoid(30.0 * (0.3 - first)) + 140.0 * torch.sigmoid(30.0 * (0.35 - second))
-    shade = 0.5 + 0.5 * torch.sin(6.0 * points)
-    colors = torch.where((first < second)[..., None], shade, 1.0 - shade.flip(-1))
+    code = EMPTY + 170.0 * torch.sigmoid(30.0 * (radius - first)) + 140.0 * torch.sigmoid(30.0 * (0.35 - second))
+    shades = shade(points).expand_as(points)
+    colors = torch.where((first < second)[..., None], shades, 1.0 - shades.flip(-1))
     codes = torch.cat([code[..., None], 255.0 * colors], dim=-1).round().clamp(0, 255).to(torch.uint8)
-    middle = (torch.arange(cells) + 0.5) * (2.0 / cells) - 1.0
-    at = torch.stack(torch.meshgrid(middle, middle, middle, indexing="ij"), dim=-1)
-    occupied = distances(at).amin(dim=-1) < 0.6
     known = (distances(points).amin(dim=-1) < 0.9) | (points.abs().amax(dim=-1) > 0.9)
     codes[~known] = torch.tensor([EMPTY, 0, 0, 0], dtype=torch.uint8)
-    return VoxelGrid(codes, known, occupied)
+    return Voxels(codes, known)
 
 
-def scene(kind: str) -> SimpleNamespace:
-    """`.model` as far as a page needs one, `.voxels`, `.cameras`, `.names` and `.orbit`."""
+def scene(kind: str, styles: int = 1) -> SimpleNamespace:
+    """What a page needs of a `StylisedScene`, with `.voxels` of one or two styles, and `.orbit`."""
     background = None
     if kind == "ndc":
         box = SceneBox(torch.tensor([[-1.2, -1.3, -1.0], [1.2, 1.3, 1.0]]))
@@ -68,25 +82,30 @@ def scene(kind: str) -> SimpleNamespace:
     else:
         space = ContractedSpace(unit=3.0)
         cameras = look_from((3.3, 1.2, 1.5), (-3.0, 2.4, 1.2), (0.9, -3.9, 0.6))
-    model = SimpleNamespace(space=space, background=background, config=SimpleNamespace(num_steps=NUM_STEPS))
+    display = SimpleNamespace(own=SimpleNamespace(mix=STYLISED))
+    config = SimpleNamespace(num_steps=NUM_STEPS)
+    model = SimpleNamespace(space=space, background=background, config=config, display=display)
     names = [f"{number}.png" for number in range(len(cameras))]
     orbit: Orbit = make_orbit(space, cameras, 0, 6.0 if kind == "contracted" else 2.0)
-    voxels = balls(31, 12)
+    voxels = balls(31, 12, styles)
     if kind == "contracted":
         put_walls(voxels)
-    return SimpleNamespace(model=model, voxels=voxels, cameras=cameras, names=names, orbit=orbit)
+    made = {"name": "scene", "painting": "sea.jpg", "style": "sea", "method": "hier-style", "iterations": 7}
+    return SimpleNamespace(
+        model=model, voxels=voxels, cameras=cameras, names=names, orbit=orbit, title="A scene", **made
+    )
 
 
-def put_walls(voxels: VoxelGrid) -> None:
+def put_walls(grid: VoxelGrid) -> None:
     """Coloured walls far away, where the contraction bends rays."""
-    axis = torch.linspace(-1.0, 1.0, len(voxels.codes))
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
-    wall = points.abs().amax(dim=-1) > 0.7
-    voxels.codes[wall] = torch.cat(
-        [torch.full_like(points[..., :1], 120.0), 127.0 + 120.0 * torch.sin(9.0 * points)], -1
-    )[wall].to(torch.uint8)
-    voxels.known |= wall
-    voxels.occupied[:] = True
+    for voxels in (*grid.styles, grid.coarse):
+        axis = torch.linspace(-1.0, 1.0, len(voxels.codes))
+        points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+        wall = points.abs().amax(dim=-1) > 0.7
+        density = torch.full_like(points[..., :1], 120.0)
+        voxels.codes[wall] = torch.cat([density, 127.0 + 120.0 * torch.sin(9.0 * points)], -1)[wall].to(torch.uint8)
+        voxels.known |= wall
+    grid.occupied[:] = True
 
 
 def psnr(first, second) -> float:

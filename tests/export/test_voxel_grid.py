@@ -11,7 +11,7 @@ from sparsestyle_ns.core.occupancy import Occupancy
 from sparsestyle_ns.evaluation.held_out import exact_outputs
 from sparsestyle_ns.export.orbit import make_orbit, pinholes, survey, turned
 from sparsestyle_ns.export.stylised_scene import load_scene
-from sparsestyle_ns.export.voxel_grid import VoxelGrid, bake_voxels, last_step_cells, picture_of_voxels, render_voxels
+from sparsestyle_ns.export.voxel_grid import Voxels, bake_voxels, last_step_cells, picture_of_voxels, render_voxels
 from sparsestyle_ns.export.web_page import median_depth
 from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT
 from sparsestyle_ns.rendering.mixing import Mix
@@ -21,7 +21,7 @@ def test_interpolation_is_exact_for_what_is_linear():
     axis = torch.arange(5)
     x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
     codes = torch.stack([10 + x, 20 + 3 * y, 5 * z, x + y + z], dim=-1).to(torch.uint8)
-    voxels = VoxelGrid(codes, torch.ones(5, 5, 5, dtype=torch.bool), torch.ones(2, 2, 2, dtype=torch.bool))
+    voxels = Voxels(codes, torch.ones(5, 5, 5, dtype=torch.bool))
     points = 2.0 * torch.rand(100, 3, generator=torch.Generator().manual_seed(0)) - 1.0
     x, y, z = (2.0 * points + 2.0).unbind(-1)
     torch.testing.assert_close(voxels.interpolate(points), torch.stack([10 + x, 20 + 3 * y, 5 * z, x + y + z], dim=-1))
@@ -44,7 +44,7 @@ def test_a_ray_through_voxels_is_the_sum_over_its_samples():
             cell = tuple(((0.5 * position[0] + 0.5) * 12).long().clamp(0, 11).tolist())
             if not small.voxels.occupied[cell]:
                 continue
-            code, *shade = small.voxels.interpolate(position)[0].tolist()
+            code, *shade = small.voxels.styles[0].interpolate(position)[0].tolist()
             density = DENSITY_UNIT * math.expm1(DENSITY_STEP * (code - 1)) if code > 1.05 else 0.0
             alpha = 1 - math.exp(-density * float(segments.extent.norm()) / NUM_STEPS)
             color, light = color + light * alpha * torch.tensor(shade) / 255, light * (1 - alpha)
@@ -76,12 +76,12 @@ def test_cells_of_the_last_step_are_known(kind):
 
 def test_fog_outside_of_what_is_occupied_counts_only_in_the_last_step():
     small = scene("ndc")
-    empty = VoxelGrid(small.voxels.codes, small.voxels.known, torch.zeros_like(small.voxels.occupied))
+    empty = replace(small.voxels, occupied=torch.zeros_like(small.voxels.occupied))
     before = picture_of_voxels(empty, small.model, small.cameras[:1])
     assert torch.equal(before, torch.zeros_like(before))
     foggy = balls(31, 12)
-    foggy.codes[..., -1, :] = torch.tensor([60, 0, 255, 0], dtype=torch.uint8)
-    after = picture_of_voxels(VoxelGrid(foggy.codes, foggy.known, empty.occupied), small.model, small.cameras[:1])
+    foggy.styles[0].codes[..., -1, :] = torch.tensor([60, 0, 255, 0], dtype=torch.uint8)
+    after = picture_of_voxels(replace(foggy, occupied=empty.occupied), small.model, small.cameras[:1])
     assert after[..., 1].mean() > 0.5
 
 
@@ -91,7 +91,7 @@ def exported(patterned_run):
     loaded = load_scene(patterned_run / "config.yml")
     exact = exact_outputs(loaded.model, loaded.cameras[1:2])
     orbit = make_orbit(loaded.model.space, loaded.cameras, 1, median_depth(exact))
-    return loaded, bake_voxels(loaded.model, 95, survey(orbit, loaded.cameras)), orbit
+    return loaded, bake_voxels([loaded.model], 95, survey(orbit, loaded.cameras)), orbit
 
 
 def test_turned_views_that_no_photo_shows_are_there_as_well(exported):
@@ -105,12 +105,13 @@ def test_turned_views_that_no_photo_shows_are_there_as_well(exported):
 
 def test_voxels_hold_the_fields_values(exported):
     loaded, voxels, _ = exported
-    index = voxels.known.nonzero()[::97]
+    style = voxels.styles[0]
+    index = style.known.nonzero()[::97]
     shade = loaded.model.bake(8).shade(index.float() * (2.0 / 95) - 1.0)
-    density = DENSITY_UNIT * torch.expm1(DENSITY_STEP * (voxels.codes[tuple(index.unbind(-1))][:, 0].float() - 1))
+    density = DENSITY_UNIT * torch.expm1(DENSITY_STEP * (style.codes[tuple(index.unbind(-1))][:, 0].float() - 1))
     torch.testing.assert_close(density, shade[:, 1], rtol=0.04, atol=0.5 * DENSITY_UNIT)
     torch.testing.assert_close(
-        voxels.codes[tuple(index.unbind(-1))][:, 1:] / 255.0, shade[:, 2:5], atol=0.6 / 255, rtol=0
+        style.codes[tuple(index.unbind(-1))][:, 1:] / 255.0, shade[:, 2:5], atol=0.6 / 255, rtol=0
     )
 
 
@@ -120,12 +121,13 @@ def test_where_no_empty_space_is_skipped_every_cell_counts(exported):
     camera, before, baked = pinholes(loaded.cameras[1:2], 16), loaded.model.occupancy, []
     for occupancy in (None, Occupancy(4)):
         loaded.model.occupancy = occupancy
-        baked.append(bake_voxels(loaded.model, 32, [camera]))
+        baked.append(bake_voxels([loaded.model], 32, [camera]))
     loaded.model.occupancy = before
     without, everywhere = baked
     assert without.occupied.all()
-    assert torch.equal(without.known, everywhere.known) and without.known.any()
-    assert torch.equal(without.codes, everywhere.codes)
+    for one, other in ((without.styles[0], everywhere.styles[0]), (without.coarse, everywhere.coarse)):
+        assert torch.equal(one.known, other.known) and one.known.any()
+        assert torch.equal(one.codes, other.codes)
 
 
 @pytest.mark.parametrize("mix", [Mix(0.0), Mix(0.5, 0.3)])
@@ -133,7 +135,7 @@ def test_a_run_whose_config_asks_for_less_of_the_style_is_exported_so(exported, 
     loaded, _, _ = exported
     camera, before = loaded.cameras[1:2], loaded.model.display.own
     loaded.model.display.own = replace(before, mix=mix)
-    voxels, exact = bake_voxels(loaded.model, 95, [camera]), exact_outputs(loaded.model, camera)["rgb"]
+    voxels, exact = bake_voxels([loaded.model], 95, [camera]), exact_outputs(loaded.model, camera)["rgb"]
     loaded.model.display.own = before
-    assert psnr(picture_of_voxels(voxels, loaded.model, camera), exact) > 33
+    assert psnr(picture_of_voxels(voxels, loaded.model, camera, mix), exact) > 33
     assert psnr(exact, exact_outputs(loaded.model, camera)["rgb"]) < 30

@@ -65,6 +65,7 @@ ELSEWHERE = {
     "sparsestyle_ns.field_components.hash_grid_triton": "needs CUDA or Triton's interpreter: test_hash_grid.py",
     "sparsestyle_ns.rendering.baked_kernels.march_rays": "is what march_compiled calls",
     "sparsestyle_ns.core.camera_paths": "takes cameras of a scene: test_camera_paths.py and test_camera_geometry.py",
+    "sparsestyle_ns.core.pinhole": "takes a camera: test_pinhole.py",
     "sparsestyle_ns.core.schedules": "test_schedules.py and test_hard_schedules.py",
     "sparsestyle_ns.losses.stylization.default_weights": "takes no input: test_stylization.py",
     "sparsestyle_ns.losses.style_index.check_style": "refuses, and returns nothing: test_nnfm.py",

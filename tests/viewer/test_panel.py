@@ -13,18 +13,22 @@ from copy import deepcopy
 from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Callable, Iterator, List
+from typing import Callable, Dict, Iterator, List
 
 import numpy as np
 import pytest
 import torch
 import yaml
 from conftest import run_entrypoint
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.viewer import render_state_machine
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from nerfstudio.viewer.utils import CameraState, get_camera
 from nerfstudio.viewer.viewer import Viewer
 from PIL import Image
 
+from sparsestyle_ns.core.pinhole import pinhole_rays
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
 from sparsestyle_ns.engine.training import Training, warm_start
@@ -35,6 +39,7 @@ from sparsestyle_ns.pipelines.scene_views import cameras_between
 from sparsestyle_ns.rendering.baked import MOST_BAKED
 from sparsestyle_ns.runs.run_folder import find_config
 from sparsestyle_ns.style.painting import Painting
+from sparsestyle_ns.viewer import adjustments
 from sparsestyle_ns.viewer.baking import STEPS_BETWEEN
 from sparsestyle_ns.viewer.panel import NO_BLEND, StylePanel
 from sparsestyle_ns.viewer.styles import Style, plain
@@ -130,6 +135,26 @@ def test_sliders_change_the_viewers_picture_and_no_other(panel: StylePanel) -> N
     assert torch.equal(panel.pipeline.model.get_outputs_for_camera(camera)["rgb"], own)
     panel.strength.value, panel.geometry.value = 1.0, 0.0
     assert torch.equal(drawn(panel, "depth"), drawn(panel, "depth_coarse"))
+
+
+def test_a_pictures_rays_are_made_once_and_its_depth_map_is_nerfstudios(
+    panel: StylePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poses, made = panel.pipeline.datamanager.train_dataset.cameras.camera_to_worlds, []
+    state = CameraState(fov=0.8, aspect=1.5, c2w=poses[0], camera_type=CameraType.PERSPECTIVE)
+    monkeypatch.setattr(adjustments, "pinhole_rays", lambda camera: made.append(camera) or pinhole_rays(camera))
+    client = SimpleNamespace(camera=SimpleNamespace(aspect=1.5))
+
+    def picture() -> Dict[str, torch.Tensor]:
+        thread = RenderStateMachine(panel.viewer, 10.0, client)
+        thread.state = "high"
+        return thread._render_img(state)
+
+    found = picture()
+    assert len(made) == 1 and found["gl_z_buf_depth"].shape == found["depth"].shape
+    monkeypatch.setattr(render_state_machine, "get_camera", get_camera)
+    for name, value in picture().items():
+        torch.testing.assert_close(found[name], value, atol=2e-3, rtol=1e-3)
 
 
 def test_without_a_gpu_the_viewer_begins_with_baked_pictures(panel: StylePanel) -> None:

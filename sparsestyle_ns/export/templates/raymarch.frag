@@ -1,6 +1,7 @@
 #version 300 es
 // One ray a pixel through the voxels of a stylised scene, with the steps of the exact render. core/spaces.py and
-// rendering/render.py do the same in Python, export/voxel_grid.py with these voxels.
+// rendering/render.py do the same in Python, rendering/mixing.py what lies between the fields, export/voxel_grid.py all
+// of it with these voxels.
 precision highp float;
 precision highp int;
 precision highp sampler3D;
@@ -10,8 +11,10 @@ const float MAX_OPTICAL_DEPTH = 80.0;
 const float MIN_FORWARD = 1e-6;
 const float MAX_DISTANCE = 1e4;
 
-uniform sampler3D u_voxels;     // rgb: colour, a: code of the density; z is the first axis
-uniform sampler3D u_occupancy;  // 1 in cells that hold anything
+uniform sampler3D u_style, u_other, u_coarse;  // rgb: colour, a: code of the density; z is the first axis
+uniform sampler3D u_clearance;                 // how many cells away the nearest is that holds anything, of 255
+uniform float u_strength, u_density_share, u_blend;
+uniform float u_divider;                       // left of it, in pixels, is the coarse field
 uniform int u_space, u_num_steps;
 uniform bool u_unbounded;
 uniform vec3 u_minimum, u_maximum;       // NDC, box: what becomes the cube
@@ -78,30 +81,60 @@ vec3 point(float s) {
     return position * (norm < 1.0 ? 0.5 : (1.0 - 0.5 / norm) / norm);
 }
 
+float density_of(float code) {
+    float steps = 255.0 * code - 1.0;
+    return steps > u_rounding ? u_density_unit * (exp(u_density_step * steps) - 1.0) : 0.0;
+}
+
+// Colour and density of a field, at a share of the cube's sides.
+vec4 field(sampler3D voxels, vec3 share) {
+    vec3 texels = vec3(textureSize(voxels, 0));
+    vec4 value = textureLod(voxels, (share * (texels - 1.0) + 0.5) / texels, 0.0);
+    return vec4(value.rgb, density_of(value.a));
+}
+
+vec4 mixture(vec3 share, float strength, float density_share) {
+    vec4 value = vec4(0.0);
+    if (strength > 0.0) {
+        value = field(u_style, share);
+        if (u_blend > 0.0) value = mix(value, field(u_other, share), u_blend);
+    }
+    if (density_share == 1.0) return value;
+    return mix(field(u_coarse, share), value, vec4(vec3(strength), density_share));
+}
+
 void main() {
     vec2 pixel = vec2(gl_FragCoord.x, u_size.y - gl_FragCoord.y);
     vec3 seen = vec3((pixel.x - u_center.x) / u_focal.x, (u_center.y - pixel.y) / u_focal.y, -1.0);
     vec3 direction = normalize(mat3(u_pose) * seen);
+    bool before = pixel.x < u_divider;
+    float strength = before ? 0.0 : u_strength, density_share = before ? 0.0 : u_density_share;
     vec3 sum = vec3(0.0);
     float light = 1.0;
     if (enter(u_pose[3].xyz, direction)) {
-        float step = 1.0 / float(u_num_steps);
-        ivec3 cells = textureSize(u_occupancy, 0);
-        vec3 texels = vec3(textureSize(u_voxels, 0));
+        float step = 1.0 / float(u_num_steps), length_ = length(extent) * step;
+        ivec3 cells = textureSize(u_clearance, 0);
+        // Steps that surely lead out of no more than one cell; how a contraction bends them, nobody knows.
+        float steps_a_cell = u_space == CONTRACTED ? 0.0 : 1.998 / (float(cells.x) * length_ + 1e-6);
         for (int i = 0; i < u_num_steps; i++) {
             bool last = u_unbounded && i == u_num_steps - 1;
             vec3 share = clamp(0.5 * point((float(i) + 0.5) * step) + 0.5, 0.0, 1.0).zyx;
-            ivec3 cell = min(ivec3(share * vec3(cells)), cells - 1);
-            if (!last && texelFetch(u_occupancy, cell, 0).r < 0.5) continue;
-            vec4 value = textureLod(u_voxels, (share * (texels - 1.0) + 0.5) / texels, 0.0);
-            float code = 255.0 * value.a - 1.0;
-            if (code <= u_rounding) continue;
-            float density = u_density_unit * (exp(u_density_step * code) - 1.0);
-            float length_ = distance(point(float(i) * step), point(float(i + 1) * step));
-            float left = exp(-(last ? MAX_OPTICAL_DEPTH : min(density * length_, MAX_OPTICAL_DEPTH)));
+            if (!last) {
+                ivec3 cell = min(ivec3(share * vec3(cells)), cells - 1);
+                float clear = 255.0 * texelFetch(u_clearance, cell, 0).r;
+                if (clear > 0.5) {
+                    i += int((floor(clear + 0.5) - 1.0) * steps_a_cell);
+                    if (u_unbounded) i = min(i, u_num_steps - 2);
+                    continue;
+                }
+            }
+            vec4 value = mixture(share, strength, density_share);
+            if (value.a <= 0.0) continue;
+            if (u_space == CONTRACTED) length_ = distance(point(float(i) * step), point(float(i + 1) * step));
+            float left = exp(-(last ? MAX_OPTICAL_DEPTH : min(value.a * length_, MAX_OPTICAL_DEPTH)));
             sum += light * (1.0 - left) * value.rgb;
             light *= left;
-            if (light < 1e-4) break;
+            if (light < 1e-3) break;
         }
     }
     color = vec4(sum + light * u_background, 1.0);

@@ -1,0 +1,109 @@
+// Draws the voxels with WebGL2: one ray a pixel, by raymarch.frag.
+
+function compile(gl, type, source) {
+  const shader = gl.createShader(type);
+  gl.shaderSource(shader, source);
+  gl.compileShader(shader);
+  if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+  return shader;
+}
+
+function makeProgram(gl) {
+  const corners =
+    "#version 300 es\nvoid main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }";
+  const program = gl.createProgram();
+  gl.attachShader(program, compile(gl, gl.VERTEX_SHADER, corners));
+  gl.attachShader(program, compile(gl, gl.FRAGMENT_SHADER, document.getElementById("shader").textContent.trim()));
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
+  return program;
+}
+
+function makeTexture(gl, unit, side, internal, format, filter, bytes) {
+  gl.activeTexture(gl.TEXTURE0 + unit);
+  gl.bindTexture(gl.TEXTURE_3D, gl.createTexture());
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T, gl.TEXTURE_WRAP_R]) {
+    gl.texParameteri(gl.TEXTURE_3D, axis, gl.CLAMP_TO_EDGE);
+  }
+  gl.texParameteri(gl.TEXTURE_3D, gl.TEXTURE_MIN_FILTER, filter);
+  gl.texParameteri(gl.TEXTURE_3D, gl.TEXTURE_MAG_FILTER, filter);
+  gl.texImage3D(gl.TEXTURE_3D, 0, internal, side, side, side, 0, format, gl.UNSIGNED_BYTE, bytes);
+  if (gl.getError() !== gl.NO_ERROR) throw new Error("This device has too little graphics memory for the scene.");
+}
+
+/** Hands the voxels to the graphics card; in the shader the style, the other one, the coarse field and the clearance. */
+function makeTextures(gl, at, voxels) {
+  const side = scene.styles[0].resolution + 1;
+  if (side > gl.getParameter(gl.MAX_3D_TEXTURE_SIZE)) {
+    throw new Error("This device's graphics can't hold the scene; export it with a smaller --resolution.");
+  }
+  makeTexture(gl, 0, scene.cells, gl.R8, gl.RED, gl.NEAREST, voxels.clearance);
+  makeTexture(gl, 1, scene.coarse.resolution + 1, gl.RGBA8, gl.RGBA, gl.LINEAR, voxels.coarse);
+  voxels.styles.forEach((texels, i) => makeTexture(gl, 2 + i, side, gl.RGBA8, gl.RGBA, gl.LINEAR, texels));
+  gl.uniform1i(at("u_clearance"), 0);
+  gl.uniform1i(at("u_coarse"), 1);
+  gl.uniform1i(at("u_style"), 2);
+  gl.uniform1i(at("u_other"), 1 + voxels.styles.length);
+}
+
+/** Tells the shader what stays as it is. */
+function describeScene(gl, at) {
+  const { space, density } = scene;
+  gl.uniform1i(at("u_space"), ["ndc", "box", "contracted"].indexOf(space.kind));
+  gl.uniform1i(at("u_unbounded"), space.unbounded);
+  gl.uniform3fv(at("u_minimum"), space.minimum);
+  gl.uniform3fv(at("u_maximum"), space.maximum);
+  gl.uniform2fv(at("u_focal_over_half_size"), space.focal_over_half_size);
+  gl.uniform2fv(at("u_depths"), space.depths);
+  gl.uniform1f(at("u_near"), space.near);
+  gl.uniform1f(at("u_unit"), space.unit);
+  gl.uniform1f(at("u_density_unit"), density.unit);
+  gl.uniform1f(at("u_density_step"), density.step);
+  gl.uniform1f(at("u_rounding"), density.rounding);
+  gl.uniform3fv(at("u_background"), scene.background);
+}
+
+/** A function that draws what a camera sees, in a look, with a share of the steps, and returns the seconds it took. */
+function makeRenderer(gl, voxels) {
+  const program = makeProgram(gl);
+  gl.useProgram(program);
+  const at = (name) => gl.getUniformLocation(program, name);
+  makeTextures(gl, at, voxels);
+  describeScene(gl, at);
+  const changing = ["u_num_steps", "u_pose", "u_focal", "u_center", "u_size", "u_strength", "u_density_share", "u_blend", "u_divider"];
+  const places = Object.fromEntries(changing.map((name) => [name, at(name)]));
+  const pixel = new Uint8Array(4);
+  return ({ pose, camera }, look, steps, width, height) => {
+    const start = performance.now();
+    [canvas.width, canvas.height] = [width, height];
+    gl.viewport(0, 0, width, height);
+    const scale = Math.min(width / camera.width, height / camera.height); // the whole photo fits in
+    gl.uniform2f(places.u_focal, scale * camera.fx, scale * camera.fy);
+    gl.uniform2f(
+      places.u_center,
+      0.5 * width + scale * (camera.cx - 0.5 * camera.width),
+      0.5 * height + scale * (camera.cy - 0.5 * camera.height),
+    );
+    gl.uniform2f(places.u_size, width, height);
+    gl.uniformMatrix4fv(places.u_pose, false, toColumns(pose));
+    gl.uniform1i(places.u_num_steps, Math.round(steps * scene.num_steps));
+    gl.uniform1f(places.u_strength, look.strength);
+    gl.uniform1f(places.u_density_share, look.strength * look.geometry);
+    gl.uniform1f(places.u_blend, look.blend);
+    gl.uniform1f(places.u_divider, look.divider === null ? -1 : look.divider * width);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); // waits for the picture
+    return (performance.now() - start) / 1000;
+  };
+}
+
+/** A 3 × 4 pose, by rows, as a 4 × 4 matrix by columns. */
+function toColumns(pose) {
+  const columns = [];
+  for (let column = 0; column < 4; column++) {
+    for (let row = 0; row < 3; row++) columns.push(pose[row][column]);
+    columns.push(column === 3 ? 1 : 0);
+  }
+  return columns;
+}
