@@ -689,7 +689,9 @@ TABLE = [
         "sparsestyle export {style} --format splat --max-splats 10 --output-path a.ply",
         None,
     ),
-    Advice("--format … takes ", None, "sparsestyle export {style} --format ply --output-path a.ply"),  # the next test
+    Advice(
+        "--format … takes ", None, "sparsestyle export {style} --format ply --output-path a.ply"
+    ),  # tests/export/test_web_page.py
     Advice("stylise one coarse run twice (--coarse-run)", None, None),  # tests/export/test_web_page.py
     Advice("; export the run with --format splat.", None, None),  # tests/viewer/test_splat_controls.py
     # ns-export, in tests/export/test_ns_export.py
@@ -762,11 +764,6 @@ def test_what_a_sentence_says_to_do_can_be_done(
     monkeypatch.setattr(HierStylePipeline, "get_training_callbacks", lambda pipeline, attributes: [])
     monkeypatch.setattr(style_trainer, "warm_start", lambda *arguments: iter(()))
     follow(advice.right, place)
-
-
-def test_most_exports_are_of_one_run(place: SimpleNamespace) -> None:
-    with pytest.raises(SystemExit, match="--format ply takes one run, not 2"):
-        typed("sparsestyle export {style} {style} --format ply --output-path a.ply", place)
 
 
 def test_the_table_has_every_sentence_that_says_what_to_type() -> None:
