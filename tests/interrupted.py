@@ -1,4 +1,4 @@
-"""Commands in processes of their own, to which a real SIGINT is sent at a chosen moment.
+"""Commands in processes of their own, to which a real SIGINT may be sent at a chosen moment.
 
 They are forked from a server that has imported everything once (see `hard.trial`), and wait at the moment until the
 signal comes.
@@ -13,7 +13,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, List
+from typing import Any, List, Optional
 
 from hard import trial
 
@@ -31,13 +31,13 @@ ENTRYPOINTS = {
 
 @dataclass
 class Ending:
-    """How a command ended after Ctrl-C."""
+    """How a command ended."""
 
     status: int
     printed: str
 
     def assert_told(self, sentence: str = "Stopped by Ctrl-C.") -> None:
-        """It ended with status 130, no traceback, and this sentence on a line of its own."""
+        """After Ctrl-C it ended with status 130, no traceback, and this sentence on a line of its own."""
         assert self.status == 130, f"status {self.status}\n{self.printed[-3000:]}"
         for word in ("Traceback", "Exception ignored", "KeyboardInterrupt"):
             assert word not in self.printed, self.printed[-3000:]
@@ -72,22 +72,37 @@ def interrupt(command: List[str], moment: str, folder: Path, presses: int = 1, c
     return Ending(process.exitcode, log.read_text())
 
 
+def finish(command: List[str], folder: Path) -> Ending:
+    """Runs a command to its own end."""
+    folder.mkdir(parents=True, exist_ok=True)
+    log = folder / "log.txt"
+    process = trial.start(_run, log, [*map(str, command)], None, None, 0)
+    try:
+        process.join(SECONDS)
+        assert process.exitcode is not None, log.read_text()[-3000:]
+    finally:
+        process.kill()
+        process.join()
+    return Ending(process.exitcode, log.read_text())
+
+
 def _wait(condition: Any) -> None:
     end = time.monotonic() + SECONDS
     while not condition() and time.monotonic() < end:
         time.sleep(0.02)
 
 
-def _run(command: List[str], moment: str, here: Path, call: int) -> None:
+def _run(command: List[str], moment: Optional[str], here: Optional[Path], call: int) -> None:
     """What the process does: the command, as its console script would."""
     from sparsestyle_ns.utils.interrupts import guard_nerfstudio
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # the server ignores it
     sys.argv = command
-    guard_nerfstudio(("coarse-fewshot", "hier-style"))  # as when the package is loaded
-    _linger_at(moment, here, call)
     module, name = ENTRYPOINTS[command[0]].split(":")
     try:
+        guard_nerfstudio(("coarse-fewshot", "hier-style"))  # as when the package is loaded
+        if moment is not None:
+            _linger_at(moment, here, call)
         getattr(importlib.import_module(module), name)()
     finally:
         atexit._run_exitfuncs()  # which multiprocessing leaves out

@@ -22,6 +22,7 @@ from test_docs import ROOT, all_flags, nerfstudio_flags, subcommands
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.studies.time_budget import Budget
 from sparsestyle_ns.utils.errors import InputError
 
 FLAG = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
@@ -65,7 +66,9 @@ def test_what_is_printed_names_flags_and_commands_that_exist() -> None:
 
     programs = {script.name for script in importlib.metadata.entry_points(group="console_scripts")}
     theirs = nerfstudio_flags("ns-render") | nerfstudio_flags("ns-viewer") | {"--gpu", "--no-gpu"}
-    theirs |= nerfstudio_flags("ns-process-data") | {"--matching-method", "--num-downscales"}  # of its base classes
+    theirs |= (
+        nerfstudio_flags("ns-export") | nerfstudio_flags("ns-process-data") | {"--matching-method", "--num-downscales"}
+    )  # of its base classes
     known, wrong = all_flags() | theirs | {"--help", "--force", "--load-config"}, []
     for sentence in printed_strings():
         for flag in FLAG.findall(sentence.text):
@@ -98,16 +101,22 @@ def place(
     from nerfstudio.utils import writer
 
     from sparsestyle_ns.studies import paper_studies, tradeoff
-    from sparsestyle_ns.studies.tradeoff_report import Report
 
     monkeypatch.setattr(Trainer, "train", lambda trainer: None)
     monkeypatch.setattr(writer, "setup_event_writer", lambda *arguments, **settings: None)
     monkeypatch.setattr(paper_studies, "_run_study", lambda title, options, *rest: options.output_path)
-    monkeypatch.setattr(tradeoff, "measure", lambda study, options, budget: Report("fern", {}, []))
+    monkeypatch.setattr(tradeoff, "measure", quick_report)
     monkeypatch.chdir(tmp_path)
     return SimpleNamespace(
         scene=llff_scene, painting=painting, coarse=runs.coarse, style=runs.style, outputs=tmp_path / "outputs"
     )
+
+
+def quick_report(study: object, options: object, budget: Budget) -> SimpleNamespace:
+    """What `sparsestyle tradeoff` finds: something, unless there is less than a second for it."""
+    measured = [] if budget.left < 1.0 else ["a curve"]
+    lists = {"measured": measured, "recommendation": [], "left_out": [], "everything_left_out": lambda: []}
+    return SimpleNamespace(**lists, write=lambda folder: folder / "index.html")
 
 
 def typed(command: str, place: SimpleNamespace) -> None:
@@ -365,6 +374,17 @@ def skip_all(place: SimpleNamespace) -> None:
     trainer._look_at_skipped(19)
 
 
+def is_held(place: SimpleNamespace) -> None:
+    from sparsestyle_ns.runs import run_folder
+
+    def held(*arguments: object) -> None:
+        raise BlockingIOError
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run_folder.fcntl, "flock", held)
+        typed(coarse("--timestamp held"), place)
+
+
 NO_ERRORS = (
     "A coarse-fewshot scene in the style of a painting, ",  # help
     "Tools around stylised scenes. ",
@@ -381,6 +401,7 @@ TABLE = [
     Advice(" would leave no image to train on", coarse("", "--eval-interval 1"), coarse("", "--eval-interval 2")),
     Advice(" is no scale: give a number", coarse("", "--bound-scale 0"), coarse("", "--bound-scale 0.75")),
     Advice(" names no folder: give N", coarse("", "--downscale-factor 0"), coarse("", "--downscale-factor 1")),
+    Advice("; name the folder of a scene.", "sparsestyle effects --data {coarse}", effects("")),
     Advice("name it last, such as colmap", "sparsestyle effects --data .", effects("llff-data")),
     Advice(
         "put the photos there, or choose another folder with --downscale-factor",
@@ -449,6 +470,17 @@ TABLE = [
         coarse("--machine.device-type cpu"),
     ),
     Advice("name a folder that can be written to with --output-dir", no_room, coarse("--output-dir elsewhere")),
+    Advice(
+        "leave --load-step out to go on from ",
+        lambda place: goes_on("--load-step 7 --max-num-iterations 4", place),
+        lambda place: goes_on("--max-num-iterations 4", place),
+    ),
+    Advice(
+        " is a folder; name it with --load-dir",
+        lambda place: typed(coarse(f"--load-checkpoint {place.coarse}/nerfstudio_models"), place),
+        lambda place: goes_on("--max-num-iterations 4", place),
+    ),
+    Advice("or name a new run with --timestamp", is_held, coarse("--timestamp b")),
     Advice("already; name a new one with --timestamp", lambda place: twice("first", place), coarse("--timestamp b")),
     Advice(
         "give shares from 0 to 1 with --optimizers.GROUP.scheduler",
@@ -559,7 +591,7 @@ TABLE = [
         "sparsestyle evaluate {coarse} --output-path ./report.json",
     ),
     Advice(
-        "name another file with --output-path",
+        "; name another place with ",
         "sparsestyle evaluate {coarse} --output-path {painting}/report.json",
         "sparsestyle evaluate {coarse} --output-path report.json",
     ),
@@ -617,12 +649,21 @@ TABLE = [
         None,  # a line of the report
         "sparsestyle tradeoff --data {scene} --style-image {painting}",
     ),
-    Advice("give a larger --budget", None, "sparsestyle tradeoff --data {scene} --budget 20m"),  # the same
+    Advice(
+        "give a larger --budget",
+        "sparsestyle tradeoff --data {scene} --budget 0.1s",
+        "sparsestyle tradeoff --data {scene} --budget 20m",
+    ),
     # Photos
     Advice(
         "name a folder that isn't, with --output",
-        lambda place: typed(f"sparsestyle prepare {photos(place)} --output photos", place),
+        lambda place: typed(f"sparsestyle prepare {photos(place)} --output {place.scene}", place),
         "sparsestyle prepare photos --output made",
+    ),
+    Advice(
+        " is in the folder of the photos, which are only read; take ",
+        lambda place: typed(f"sparsestyle prepare {photos(place)} --output photos/made", place),
+        "sparsestyle prepare photos --output photos-scene",
     ),
     Advice("leave --poses file out", None, None),  # tests/prepare
     Advice("pip install pillow-heif", read_heic, None),
@@ -649,6 +690,18 @@ TABLE = [
         "sparsestyle export {style} --format splat --max-splats 10 --output-path a.ply",
         None,
     ),
+    Advice(
+        "--format … takes ", None, "sparsestyle export {style} --format ply --output-path a.ply"
+    ),  # tests/export/test_web_page.py
+    Advice("stylise one coarse run twice (--coarse-run)", None, None),  # tests/export/test_web_page.py
+    Advice("; export the run with --format splat.", None, None),  # tests/viewer/test_splat_controls.py
+    # ns-export, in tests/export/test_ns_export.py
+    Advice("has no Gaussians yet; have them made by sparsestyle export RUN --format splat", None, None),
+    Advice("has no signed distances; take ns-export poisson --normal-method open3d", None, None),
+    Advice("has no normals of its own; add --normal-method open3d", None, None),
+    Advice("--obb-center, --obb-rotation and --obb-scale have an effect only together", None, None),
+    # ns-eval, in tests/test_nothing_lost.py
+    Advice("ns-eval writes JSON, and --output-path is ", None, None),
     # ns-render; more in tests/pipelines/test_render_command.py
     Advice("; give a number above 0.", views("rgb --downscale-factor 0"), views("rgb --downscale-factor 1")),
     Advice(", and leaves less than ", views("rgb --downscale-factor 4"), views("rgb --downscale-factor 2")),
@@ -661,13 +714,10 @@ TABLE = [
         flight("--rendered-output-names rgba"),
         flight("--rendered-output-names rgba --image-format png"),
     ),
+    Advice(" can't be made, as ", None, None),  # tests/export/test_ns_export.py
     Advice(" is a folder; give ", None, None),  # tests/test_ctrl_c.py, as the next
     Advice("There is no run's config at --load-config ", None, None),
-    Advice(
-        "Something is at --output-path ",
-        lambda place: into_pictures("pictures", place),
-        views("rgb --output-path pictures-2"),
-    ),
+    Advice("Something is at ", lambda place: into_pictures("pictures", place), views("rgb --output-path pictures-2")),
     Advice(
         " is no name of a film; take ",
         flight("--output-format video --output-path a.txt"),

@@ -1,7 +1,9 @@
 """What the commands say when they can't go on: one sentence, exit status not 0, and nothing is lost."""
 
 import copy
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -15,7 +17,9 @@ import pytest
 from conftest import TINY, TINY_STYLE, ns_train
 from nerfstudio.configs.dataparser_configs import all_dataparsers
 from PIL import Image
+from test_commands import write_ring, write_transforms
 
+from sparsestyle_ns.cli import main
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
 from sparsestyle_ns.utils.errors import InputError
 
@@ -179,6 +183,65 @@ def test_nothing_to_resume_is_said(llff_scene: Path, tmp_path: Path) -> None:
     for folder, words in ((tmp_path / "nowhere", "nothing to resume"), (tmp_path / "empty", "no checkpoint")):
         flags = ["--load-dir", str(folder), *TINY]
         assert words in refusal("coarse-fewshot", llff_scene, tmp_path / "outputs", *flags)
+
+
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        ("--load-dir {models} --load-step 7", "no checkpoint of iteration 7 in .* leave --load-step out to go on"),
+        ("--load-dir {models} --load-step -1", "There is no checkpoint of iteration -1 in .* go on from 2, the newest"),
+        ("--load-dir {models}/step-000000002.ckpt", "There is no checkpoint in .*ckpt; name a run's nerfstudio_models"),
+        ("--load-checkpoint {models}", "--load-checkpoint .* is a folder; name it with --load-dir"),
+    ],
+)
+def test_a_checkpoint_that_isnt_there_is_said(
+    runs: SimpleNamespace, llff_scene: Path, tmp_path: Path, flags: str, sentence: str
+) -> None:
+    words = flags.format(models=runs.coarse / "nerfstudio_models").split()
+    assert re.search(sentence, refusal("coarse-fewshot", llff_scene, tmp_path / "outputs", *words, *TINY))
+
+
+@pytest.mark.parametrize(
+    ("data", "sentence"),
+    [
+        ("{run}", "Error: --data {run} is a run; name the folder of a scene."),
+        ("{run}/config.yml", "Error: --data {run}/config.yml is a file; name the folder of a scene."),
+        ("{scene}/images/image003.png", "Error: --data {scene}/images/image003.png is a file; name"),
+        ("{scene}/images", "Error: {scene}/images has none of poses_bounds.npy"),
+    ],
+)
+def test_what_is_no_scene_is_called_what_it_is(
+    runs: SimpleNamespace, llff_scene: Path, data: str, sentence: str
+) -> None:
+    places = {"run": runs.coarse, "scene": llff_scene}
+    with pytest.raises(SystemExit) as ended:
+        main(["effects", "--data", data.format(**places)])
+    assert str(ended.value.code).startswith(sentence.format(**places))
+
+
+def test_a_scene_may_be_named_by_its_file(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write_transforms(tmp_path, write_ring(tmp_path))
+    main(["effects", "--data", str(tmp_path / "transforms.json")])
+    assert f"--data {tmp_path / 'transforms.json'} nerfstudio-data" in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_a_mask_that_isnt_there_is_named(tmp_path: Path) -> None:
+    write_transforms(tmp_path, write_ring(tmp_path))
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    for index, frame in enumerate(content["frames"]):
+        frame["mask_path"] = f"masks/{index}.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    config = FewShotDataManagerConfig(data=tmp_path, dataparser=copy.deepcopy(all_dataparsers["nerfstudio-data"]))
+    with pytest.raises(InputError, match=r"The mask .*masks/0\.png doesn't fit .*images/0\.png, as it isn't there"):
+        config.setup(device="cpu", test_mode="inference").train_dataset[0]
+
+
+def test_a_refused_command_leaves_no_folder(llff_scene: Path, tmp_path: Path) -> None:
+    script = "from nerfstudio.scripts.train import entrypoint; entrypoint()"
+    command = [sys.executable, "-c", script, "coarse-fewshot", "--data", str(llff_scene), "--vis", "tensorboard"]
+    command += ["--output-dir", str(tmp_path / "new" / "outputs"), "--view-ids", "99", "llff-data"]
+    assert subprocess.run(command, capture_output=True, timeout=300).returncode == 1
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_refused_command_leaves_former_runs_alone(runs: SimpleNamespace, llff_scene: Path, painting: Path) -> None:

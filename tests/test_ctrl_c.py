@@ -115,6 +115,11 @@ COMMANDS = {
     ),
     "pictures of views": ("ns-render dataset --split train --output-path {tmp}/a", "style", FRAME, 2),
     "cloud": ("ns-export pointcloud --output-dir {tmp} --normal-method open3d --num-points 100000", "style", FRAME, 3),
+    "mesh": (
+        "ns-export tsdf --output-dir {tmp}/new/folder --downscale-factor 1 --resolution 16",
+        "style",
+        "nerfstudio.exporter.texture_utils:export_textured_mesh",  # its first file is there by then
+    ),
     "tradeoff": (
         "sparsestyle tradeoff --data {scene} --output-dir {tmp}/a",
         "coarse",

@@ -6,6 +6,8 @@ import json
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Dict, List
@@ -128,6 +130,30 @@ def test_runs_that_begin_in_one_second_have_folders_of_their_own(tmp_path: Path)
     assert len(set(names)) == 2
 
 
+HOLD = """
+import sys, pathlib
+from sparsestyle_ns.runs.run_folder import hold_folder
+hold_folder(pathlib.Path(sys.argv[1]))
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_two_commands_never_train_in_one_folder_at_once(llff_scene: Path, tmp_path: Path) -> None:
+    """The first has no checkpoint yet, by which the second would see that there is a run."""
+    folder = tmp_path / "outputs" / llff_scene.name / "coarse-fewshot" / "first"
+    command = [sys.executable, "-c", HOLD, str(folder)]
+    flags = ["--timestamp", "first", "--max-num-iterations", "1", *TINY]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(SystemExit, match=r"Another ns-train is at work in .*first right now; wait .*--timestamp"):
+            ns_train("coarse-fewshot", llff_scene, tmp_path / "outputs", *flags)
+        assert folder.is_dir() and not list(folder.iterdir())
+        other.communicate()
+    ns_train("coarse-fewshot", llff_scene, tmp_path / "outputs", *flags)
+    assert steps(folder) == [0]
+
+
 def test_a_report_of_something_else_is_kept_under_another_name(run: Path, capsys: pytest.CaptureFixture) -> None:
     (run / "evaluation.json").write_text("mine")
     main(["evaluate", str(run)])
@@ -166,6 +192,29 @@ def test_a_file_that_is_there_is_written_over_only_where_that_is_asked_for(
         assert other.exists() and target.read_text() == "mine"
         main([*arguments, "--force"])
         assert target.read_text(errors="replace") != "mine"
+
+
+def test_figures_of_ns_eval_never_take_the_place_of_others(
+    runs: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = "--load-config", runs.coarse / "config.yml"
+    Path("output.json").write_text("mine")
+    ns_command("ns-eval", *config)  # without a name it takes a new one
+    assert Path("output.json").read_text() == "mine" and Path("output-2.json").is_file()
+    Path("pictures").mkdir()
+    Path("pictures/mine.png").touch()
+    before = files_below(tmp_path)
+    for flags, sentence in (
+        (["--output-path", "output-2.json"], "take output-2-2.json or another place"),
+        (["--output-path", "report.txt"], "ns-eval writes JSON, .* take report.txt.json"),
+        (["--output-path", "pictures"], "ns-eval writes JSON, .* take pictures.json"),
+        (["--output-path", "output.json/a.json"], "name another place with --output-path"),
+        (["--output-path", "a.json", "--render-output-path", "pictures"], "--render-output-path .* take pictures-2"),
+    ):
+        with pytest.raises(SystemExit, match=sentence):
+            ns_command("ns-eval", *config, *flags)
+    assert files_below(tmp_path) == before
 
 
 def test_a_gallery_without_a_name_gets_one_of_its_own(
@@ -211,6 +260,13 @@ def test_free_names_keep_suffixes_and_count_on(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     assert free_path(tmp_path / "a.html") == tmp_path / "a-3.html"
     assert free_path(tmp_path / "folder") == tmp_path / "folder-2"
+
+
+def test_the_folder_that_one_is_in_has_free_names_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here" / "below").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here" / "below")
+    assert free_path(Path(".")) == tmp_path / "here" / "below-2"
+    assert free_path(Path("..")) == tmp_path / "here-2"
 
 
 def test_a_painting_is_painted_over_only_where_that_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -16,8 +16,10 @@ MARKERS = {
 """Files that tell a scene's dataparser."""
 
 
-def _marker_of(folder: Path) -> Optional[str]:
-    return next((marker for marker in MARKERS if (folder / marker).is_file()), None)
+def _marker_of(place: Path) -> Optional[str]:
+    if place.is_file():  # which of dataparsers only nerfstudio's takes
+        return place.name if MARKERS.get(place.name) == "nerfstudio-data" else None
+    return next((marker for marker in MARKERS if (place / marker).is_file()), None)
 
 
 def parser_name(folder: Path) -> Optional[str]:
@@ -52,6 +54,8 @@ def parse_dataparser(words: Sequence[str], data: Path) -> DataParserConfig:
         raise InputError(f"There is no scene at --data {data}; name its folder.")
     if not words:
         marker = _marker_of(data)
+        if marker is None and (data.is_file() or (data / "config.yml").is_file()):
+            raise InputError(f"--data {data} is a {'file' if data.is_file() else 'run'}; name the folder of a scene.")
         if marker is None:
             unknown = f"{data} has none of {', '.join(MARKERS)}, so the dataparser isn't known"
             raise InputError(unknown, "name it last, such as colmap")

@@ -28,9 +28,12 @@ DARKEST = 3
 
 
 def images_in(folder: Path, suffixes: Sequence[str]) -> List[Path]:
-    """The files in a folder with one of these suffixes, sorted by name; hidden files are passed over."""
-    files = (path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    return sorted(path for path in files if path.suffix.lower() in suffixes)
+    """The files in a folder with one of these suffixes, sorted by name; hidden files are passed over.
+
+    Links that lead nowhere are among them, to be found when they are read.
+    """
+    files = (path for path in folder.iterdir() if path.is_file() or (path.is_symlink() and not path.exists()))
+    return sorted(path for path in files if path.suffix.lower() in suffixes and not path.name.startswith("."))
 
 
 def open_photo(path: Path, draft: bool = False) -> Image.Image:
@@ -201,7 +204,8 @@ class PhotoDataset(InputDataset):
         try:
             inside = read_mask(mask.read_bytes())
         except Exception as error:  # decoders meet a damaged file with errors of many kinds
-            raise InputError(f"The mask {mask} doesn't fit {photo}, as it can't be read: replace it.") from error
+            fault = "can't be read" if mask.exists() else "isn't there"
+            raise InputError(f"The mask {mask} doesn't fit {photo}, as it {fault}: replace it.") from error
         width, height = photo_size(photo)
         if inside.shape != (height, width):
             raise InputError(

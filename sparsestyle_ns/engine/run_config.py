@@ -3,17 +3,18 @@
 import os
 import sys
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Dict, Optional
+from typing import Any, Dict, Iterator, Optional
 
 import tyro
 import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
-from sparsestyle_ns.pipelines.render_command import begin_render
+from sparsestyle_ns.pipelines.ns_commands import begin_command
 from sparsestyle_ns.runs.checkpoints import checkpoint_path, checkpoint_step, newest_checkpoint
-from sparsestyle_ns.runs.run_folder import read_config
+from sparsestyle_ns.runs.run_folder import hold_folder, read_config
 from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.files import write_whole
@@ -33,7 +34,7 @@ class RunConfig(TrainerConfig):
     def __setstate__(self, state: Dict[str, Any]) -> None:
         """Called when a config.yml is read, which nerfstudio's commands do first of all."""
         vars(self).update(state)
-        begin_render()
+        begin_command()
 
     def get_base_dir(self) -> Path:
         """The run's folder."""
@@ -128,13 +129,22 @@ class RunConfig(TrainerConfig):
                     setattr(part, name, Path(os.path.abspath(Path(path).expanduser())))
         self.output_dir = self.output_dir.expanduser()
 
+    def hold_folder(self) -> None:
+        """Makes the run's folder, its own until the process ends; InputError where it can't, or another has it."""
+        with self._saving():
+            hold_folder(self.get_base_dir())
+
     def write_config(self) -> None:
         """Writes config.yml into the run's folder; InputError where it can't be written."""
-        folder = self.get_base_dir()
+        with self._saving():
+            write_whole(self.get_base_dir() / "config.yml", yaml.dump(self))
+
+    @contextmanager
+    def _saving(self) -> Iterator[None]:
         try:
-            write_whole(folder / "config.yml", yaml.dump(self))
+            yield
         except OSError as error:
-            where = f"{folder} ({error.strerror}); name a folder that can be written to with --output-dir."
+            where = f"{self.get_base_dir()} ({error.strerror}); name a folder that can be written to with --output-dir."
             raise InputError(f"The run can't be saved in {where}") from error
 
     def resumed_checkpoint(self) -> Optional[Path]:
@@ -146,11 +156,18 @@ class RunConfig(TrainerConfig):
                 )
         folder, step = self.load_dir, self.load_step
         if folder is None:
+            if self.load_checkpoint is not None and self.load_checkpoint.is_dir():
+                raise InputError(f"--load-checkpoint {self.load_checkpoint} is a folder; name it with --load-dir.")
             return self.load_checkpoint
         checkpoint = newest_checkpoint(folder) if step is None else checkpoint_path(folder, step)
         if checkpoint is None or not checkpoint.is_file():
-            what = "checkpoint" if step is None else f"checkpoint of iteration {step}"
-            raise InputError(f"There is no {what} in {folder}; name a run's nerfstudio_models folder.")
+            newest = newest_checkpoint(folder)
+            if newest is None:
+                raise InputError(f"There is no checkpoint in {folder}; name a run's nerfstudio_models folder.")
+            raise InputError(
+                f"There is no checkpoint of iteration {step} in {folder}; leave --load-step out to go on from "
+                f"{checkpoint_step(newest)}, the newest."
+            )
         return checkpoint
 
 

@@ -83,8 +83,10 @@ class SparseStyleTrainerConfig(RunConfig):
         if machine.num_devices * machine.num_machines > 1:
             prepare_launch()
         folder = self.get_base_dir()
-        if not folder.exists():
-            take_away_at_end(lambda: remove_empty_run(folder))
+        is_there, around = folder.exists(), [outer for outer in folder.parents if not outer.exists()]
+        self.hold_folder()
+        if not is_there:
+            take_away_at_end(lambda: remove_empty_run(folder, around))
         if is_new:  # what a run that is gone on with says stays until it is known that it can be
             self.write_config()
 

@@ -6,18 +6,17 @@ It reads a camera path only after the pipeline is loaded, and believes whatever 
 import json
 import math
 import shutil
-import sys
 import tempfile
 from pathlib import Path
-from typing import Any, Dict, List, Optional
+from typing import Any, Dict, List
 
 import numpy as np
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
 from sparsestyle_ns.data.photos import SMALLEST_SIDE
+from sparsestyle_ns.pipelines.command_output import running_command
 from sparsestyle_ns.pipelines.nerfstudio_options import render_options
-from sparsestyle_ns.pipelines.render_files import claim_output, render_whole
-from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
+from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.interrupts import take_away_at_end
 from sparsestyle_ns.utils.progress import say
 
@@ -29,27 +28,6 @@ LONGEST_SIDE = 16384
 FRAME_RATES = 0.01, 1000.0
 """Frames a second that films can have."""
 EXPORT_AGAIN = "export it again from the viewer's Render tab"
-
-
-def running_command() -> Optional[Any]:
-    """The ns-render command, with its options, that is setting up a pipeline; None where another one is."""
-    frame = sys._getframe(1)
-    while frame is not None:
-        command = frame.f_locals.get("self")
-        if frame.f_globals.get("__name__") == "nerfstudio.scripts.render" and command is not None:
-            return command
-        frame = frame.f_back
-    return None
-
-
-@exit_on_input_error
-def begin_render() -> None:
-    """Called when a config.yml has been read: where ns-render is what runs, checks it, and sees to what it writes."""
-    command = running_command()
-    if command is not None:
-        check_numbers(command)
-        claim_output(command)
-        render_whole(command)
 
 
 def check_numbers(command: Any) -> None:
@@ -72,7 +50,7 @@ def check_numbers(command: Any) -> None:
 
 def prepare_render(pipeline: VanillaPipeline) -> None:
     """Checks what ns-render was asked for, if it is what runs, before a checkpoint is loaded; an InputError refuses."""
-    command = running_command()
+    command = running_command("render")
     if command is None:
         return
     for line in render_options(command):

@@ -59,6 +59,8 @@ class Framing:
 
 def find_photos(folder: Path) -> List[Path]:
     """The photos of a folder or, if it has none, of its folder `images`, by name; an `InputError` if fewer than 3."""
+    if folder.is_file():
+        raise InputError(f"{folder} is a file, and no video; name the folder that the photos are in.")
     if not folder.is_dir():
         raise InputError(f"There is no folder {folder}; name the folder that the photos are in.")
     for place in (folder, folder / "images"):
@@ -93,6 +95,8 @@ def read_photo(path: Path, upright: bool = True) -> Photo:
             exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
             orientation, pixels = orientation_of(image), to_8_bits(image, data)
             return Photo(path, as_upright(pixels, orientation) if upright else pixels, orientation, upright, exif)
+    except FileNotFoundError as error:
+        raise InputError(f"{path} is a link that leads nowhere; put the photo there, or take it out.") from error
     except UnknownPixelsError as error:
         raise InputError(f"{path} has {error}; save it as 8-bit RGB or grey, or take it out.") from error
     except UnidentifiedImageError as error:

@@ -98,12 +98,23 @@ class TransformsPoses:
             )
         placed = [path for path in found if path in frames]
         self.used = [frames[path] for path in placed]
+        self._say_what_has_no_match(found, frames)
         if self._splits([frame["file_path"] for frame in self.used]).get(SPLITS[0]) == []:
             raise InputError(
                 f"None of the photos with poses is in {SPLITS[0]} of {self.path}: list some there, or take "
                 f"{', '.join(SPLITS)} out."
             )
         return placed
+
+    def _say_what_has_no_match(self, found: Sequence[Path], frames: Dict[Path, Dict[str, Any]]) -> None:
+        """Prints which photos and which frames are left out."""
+        used = {id(frame) for frame in self.used}
+        without_photo = [frame["file_path"] for frame in self.content["frames"] if id(frame) not in used]
+        without_pose = [path.name for path in found if path not in frames]
+        if without_photo:
+            print(f"Frames of {self.path} whose photos aren't there, and are left out: {', '.join(without_photo)}")
+        if without_pose:
+            print(f"Photos without a frame in {self.path}, which are left out: {', '.join(without_pose)}")
 
     def _frames_of(self, found: Sequence[Path]) -> Dict[Path, Dict[str, Any]]:
         """The frame of each photo that has one: that whose file_path leads there; for names that no file_path leads to,

@@ -15,9 +15,11 @@ from sparsestyle_ns.prepare.prepare_options import PrepareOptions
 from sparsestyle_ns.prepare.selection import without_useless
 from sparsestyle_ns.prepare.video import VIDEO_SUFFIXES, choose_frames
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import all_or_nothing, check_outside, check_writable, not_writable
 from sparsestyle_ns.utils.progress import track
 
 PoseSource = Literal["auto", "file", "estimate"]
+WHAT = "The scene"
 
 
 @dataclass
@@ -48,8 +50,10 @@ def prepare_scene(photos: Path, output: Path, source: PoseSource = "auto") -> Pr
     Raises:
         InputError: photos or their poses can't be used, or where they were taken can't be told.
     """
+    check_outside(output, photos)
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise InputError(f"{output} is there already; name a folder that isn't, with --output.")
+    check_writable(output, WHAT, "--output")
     read, poses = _read_photos(photos, source)
     framings = frame_photos([photo.image.size for photo in read])
     _say_what_changes(framings)
@@ -89,17 +93,18 @@ def _write(
     poses: Union[Poses, EstimatedPoses], photos: Sequence[Photo], framings: Sequence[Framing], output: Path
 ) -> List[str]:
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".prepare-", dir=output.parent) as folder:
-            scene = Path(folder) / "scene"
-            scene.mkdir()
-            names = write_photos(photos, framings, scene / "images")
-            poses.write(scene, names, framings)
-            if output.exists():
-                output.rmdir()
-            os.replace(scene, output)
+        with all_or_nothing([output]):
+            output.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(prefix=".prepare-", dir=output.parent) as folder:
+                scene = Path(folder) / "scene"
+                scene.mkdir()
+                names = write_photos(photos, framings, scene / "images")
+                poses.write(scene, names, framings)
+                if output.exists():
+                    output.rmdir()
+                os.replace(scene, output)
     except OSError as error:
-        raise InputError(f"The scene can't be written to {output} ({error.strerror}); name another folder.") from error
+        raise not_writable(output, WHAT, error.strerror, "--output") from error
     return names
 
 

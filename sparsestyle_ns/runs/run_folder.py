@@ -1,10 +1,12 @@
 """Runs on disk: finding and reading the config of one. Without torch, so that commands say at once what is wrong."""
 
 import contextlib
+import fcntl
+import os
 import re
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Dict, Sequence
 
 import yaml
 
@@ -38,16 +40,41 @@ def find_config(run: Path, method: str = "") -> Path:
     return path
 
 
-def remove_empty_run(folder: Path) -> None:
-    """Removes a run's folder that has neither a checkpoint nor a picture, and the folders around it that held it alone.
+_held: Dict[Path, int] = {}
+
+
+def hold_folder(folder: Path) -> None:
+    """Makes a run's folder, and keeps it for this process until that ends, however it does.
+
+    InputError where another process keeps it; OSError where it can't be made.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if folder.resolve() in _held:
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(descriptor)
+        raise InputError(
+            f"Another ns-train is at work in {folder} right now; wait for its end, or name a new run with --timestamp."
+        ) from error
+    except OSError:  # the file system has no locks
+        os.close(descriptor)
+        return
+    _held[folder.resolve()] = descriptor
+
+
+def remove_empty_run(folder: Path, around: Sequence[Path]) -> None:
+    """Removes a run's folder that has neither a checkpoint nor a picture, and folders around it that held it alone.
 
     What else a run has says only what it would have been.
     """
     if folder.is_dir() and not any(folder.glob("*/*.ckpt")) and not any(folder.glob("previews/*")):
         shutil.rmtree(folder, ignore_errors=True)
         with contextlib.suppress(OSError):  # of a folder that has something in it
-            for around in folder.parents[:2]:
-                around.rmdir()
+            for outer in around:
+                outer.rmdir()
 
 
 def read_config(folder: Path) -> "TrainerConfig":

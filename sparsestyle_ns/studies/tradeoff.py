@@ -1,6 +1,5 @@
 """`sparsestyle tradeoff`: measures all curves within a budget and writes the report, also when it is stopped."""
 
-import contextlib
 import gc
 import tempfile
 import warnings
@@ -20,9 +19,10 @@ from sparsestyle_ns.studies.measure_training import StageRuns
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.studies.study_options import TradeoffOptions
 from sparsestyle_ns.studies.time_budget import Budget, Plan, parse_duration, run_plans
-from sparsestyle_ns.studies.tradeoff_report import GROUPS, Fact, Report, report_folder, writing_to
+from sparsestyle_ns.studies.tradeoff_report import FILES, GROUPS, Fact, Report, report_folder, writing_to
 from sparsestyle_ns.studies.workbench import Workbench
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import all_or_nothing
 from sparsestyle_ns.utils.interrupts import PRESSES, StoppedByCtrlC, stop
 from sparsestyle_ns.utils.machine import device_name, versions
 
@@ -33,22 +33,19 @@ REPORT_SHARE = 0.05
 
 
 def tradeoff(options: TradeoffOptions) -> None:
-    """Measures, writes the report, and prints the recommendation; an `InputError` if an option can't be used."""
+    """Measures, writes the report, and prints the recommendation; an `InputError` if an option can't be used.
+
+    Where nothing could be measured, too; then nothing is left of the report.
+    """
     budget_seconds = parse_duration(options.budget)
     if options.rounds < 1:
         raise InputError(f"--rounds is {options.rounds}, but has to be at least 1.")
     study, options = study_of(options), replace(options, output_dir=report_folder(options.output_dir, options.force))
-    try:
-        report = measure(study, options, Budget(budget_seconds))
-        if STOPPED in report.left_out and not report.measured:
-            raise StoppedByCtrlC
-    except PRESSES:
-        with contextlib.suppress(OSError):  # it wasn't made yet, or has other files
-            options.output_dir.rmdir()
-        stop("Stopped by Ctrl-C before anything was measured.")
-    page = report.write(options.output_dir)
-    lines = report.recommendation or ["Nothing could be measured in the time there was; give a larger --budget."]
-    left_out = report.everything_left_out()
+    files = [options.output_dir / name for name in FILES]
+    with all_or_nothing([path for path in files if not path.exists()]):
+        report = _measured(study, options, Budget(budget_seconds))
+        page = report.write(options.output_dir)
+    lines, left_out = report.recommendation, report.everything_left_out()
     if left_out:
         lines += [f"Left out, {len(left_out)}:", *(f"  {line}" for line in left_out)]
     Console().print(*lines, sep="\n", markup=False, highlight=False, soft_wrap=True)
@@ -56,6 +53,21 @@ def tradeoff(options: TradeoffOptions) -> None:
     finish(page.resolve(), ["ns-train", config.method_name, *scene_arguments(config)])
     if STOPPED in report.left_out:
         raise StoppedByCtrlC
+
+
+def _measured(study: Study, options: TradeoffOptions, budget: Budget) -> Report:
+    """What `measure` finds; ends the process, or raises an InputError, where that is nothing."""
+    try:
+        report = measure(study, options, budget)
+        if STOPPED in report.left_out and not report.measured:
+            raise StoppedByCtrlC
+    except PRESSES:
+        stop("Stopped by Ctrl-C before anything was measured.")
+    if not report.measured and len(report.left_out) == len(options.groups or GROUPS):
+        raise InputError(f"Nothing could be measured: {report.left_out[0]}")
+    if not report.measured:
+        raise InputError("Nothing could be measured in the time there was; give a larger --budget.")
+    return report
 
 
 def study_of(options: TradeoffOptions) -> Study:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from sparsestyle_ns.utils.errors import CommandOptions, InputError
+from sparsestyle_ns.utils.files import check_outside
 
 
 @dataclass
@@ -43,6 +44,7 @@ class StyliseOptions(CommandOptions):
             raise InputError(f"--stroke-size is {self.stroke_size:g}; give a number from 0.5 to 2.")
         if self.seed < 0:
             raise InputError(f"--seed is {self.seed}; give 0 or more.")
+        check_outside(self.output, self.photos)
         try:
             self.output.mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -3,11 +3,14 @@
 import hashlib
 import os
 import re
+import shutil
 import tempfile
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePath
-from typing import BinaryIO, Callable, Iterable, Optional, Union
+from typing import BinaryIO, Callable, Iterable, Iterator, List, Optional, Union
 
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.interrupts import take_away_at_end
 
 LONGEST, LONGEST_SUFFIX = 120, 16
 """UTF-8 bytes of a file's name, and characters of its suffix, at most: some file systems take 143 bytes."""
@@ -42,6 +45,28 @@ def write_whole(
     return target
 
 
+@contextmanager
+def all_or_nothing(paths: List[Path]) -> Iterator[None]:
+    """What is made at these paths, at which nothing is yet, goes away where the context doesn't come to its end."""
+    folders = {part for path in paths for part in (path, *path.parents) if not part.exists()}
+    unfinished = list(paths)
+
+    def take_away() -> None:
+        for path in unfinished:
+            for part in path.iterdir() if path.is_dir() else [path]:
+                shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
+        for folder in sorted(folders, key=lambda folder: len(folder.parts), reverse=True) if unfinished else ():
+            with suppress(OSError):  # never made, or somebody else has put something there
+                folder.rmdir()
+
+    take_away_at_end(take_away)
+    try:
+        yield
+        unfinished.clear()
+    finally:
+        take_away()
+
+
 def digest(*contents: bytes) -> str:
     """Sixteen hexadecimal digits by which the contents of files are known again."""
     total = hashlib.sha256()
@@ -54,8 +79,15 @@ def free_path(path: Path) -> Path:
     """A path at which nothing is yet: this, else with a number behind the name."""
     found, number = path, 2
     while found.exists():
-        found, number = path.with_name(f"{path.stem}-{number}{path.suffix}"), number + 1
+        found, number = numbered(path, number), number + 1
     return found
+
+
+def numbered(path: Path, number: int) -> Path:
+    """A path beside another, with a number behind its name: also beside `.`, which has none."""
+    if path.name in ("", ".."):
+        path = path.resolve()
+    return path.with_name(f"{path.stem}-{number}{path.suffix}")
 
 
 def keep_former(path: Path, content: str) -> Optional[Path]:
@@ -90,14 +122,24 @@ def prepare_output(output_path: Path, what: str, example: str, force: bool = Fal
         raise not_writable(output_path, what, error.strerror) from error
 
 
-def check_writable(path: Path, what: str) -> None:
+def check_outside(output: Path, inputs: Path) -> None:
+    """An `InputError` where a folder that `--output` names is a person's own folder of photos, or in it."""
+    output, inputs = output.resolve(), inputs.resolve()
+    if inputs.is_dir() and (output == inputs or inputs in output.parents):
+        raise InputError(
+            f"--output {output} is in the folder of the photos, which are only read; take "
+            f"{free_path(inputs.with_name(f'{inputs.name}-scene'))} or another place outside of it."
+        )
+
+
+def check_writable(path: Path, what: str, flag: str = "--output-path") -> None:
     """An `InputError`, as of `prepare_output`, where a file or a folder can't be made; nothing is left of the trial."""
     around = next(folder for folder in path.absolute().parents if folder.exists())
     try:
         with tempfile.TemporaryFile(dir=around):
             pass
     except OSError as error:
-        raise not_writable(path, what, error.strerror) from error
+        raise not_writable(path, what, error.strerror, flag) from error
 
 
 def write_output(output_path: Path, content: Union[str, bytes], what: str, example: str) -> Path:
@@ -112,9 +154,9 @@ def write_output(output_path: Path, content: Union[str, bytes], what: str, examp
         raise not_writable(output_path, what, error.strerror) from error
 
 
-def not_writable(output_path: Path, what: str, reason: Optional[str]) -> InputError:
-    """An error that says why a command can't write a file."""
-    return InputError(f"{what} can't be written to {output_path} ({reason}); name another file with --output-path.")
+def not_writable(output_path: Path, what: str, reason: Optional[str], flag: str = "--output-path") -> InputError:
+    """An error that says why a command can't write to the place that a flag named."""
+    return InputError(f"{what} can't be written to {output_path} ({reason}); name another place with {flag}.")
 
 
 def free_name(name: str, taken: Iterable[str]) -> str:

@@ -94,8 +94,11 @@ def guard_nerfstudio(methods: Tuple[str, ...]) -> None:
     command = ns_command()
     if command is not None:
         _refuse_missing_run(methods)
+    is_run = command is not None and _run_is_of(methods)
+    if command == "export" and is_run:
+        _mind_output_dir()
     is_asked_for = command == "train" and any(word.startswith(methods) for word in sys.argv[1:])
-    if is_asked_for or (command is not None and _run_is_of(methods)):
+    if is_asked_for or is_run:
         end_on_ctrl_c()
 
 
@@ -107,6 +110,22 @@ def _refuse_missing_run(methods: Tuple[str, ...]) -> None:
     if (path / "config.yml").is_file():
         raise SystemExit(f"Error: --load-config {path} is a folder; give {path / 'config.yml'}.")
     raise SystemExit(f"Error: There is no run's config at --load-config {path}; give a run's config.yml.")
+
+
+def _mind_output_dir() -> None:
+    """Sees to it that ns-export leaves no empty folders: it makes its own before anything else, or fails to."""
+    path = Path(ns_option("output-dir") or "")
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    around = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not around.is_dir():
+        raise SystemExit(f"Error: --output-dir {path} can't be made, as {around} is no folder; name another place.")
+
+    def take_away() -> None:
+        for folder in missing:
+            with suppress(OSError):  # it isn't empty
+                folder.rmdir()
+
+    take_away_at_end(take_away)
 
 
 def ns_command() -> Optional[str]:

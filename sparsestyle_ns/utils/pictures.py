@@ -42,9 +42,9 @@ def decode(image: Image.Image, data: bytes) -> Shaped[np.ndarray, "H W channels"
     if image.mode.startswith("I;16"):
         return np.repeat(_deep_grey(image)[..., None], 3, axis=2)
     if image.mode in NO_RANGE:
-        raise UnknownPixelsError(f"pixels of the kind {image.mode} have no fixed range")
+        raise UnknownPixelsError(f"pixels of the kind {image.mode}, which have no fixed range")
     if image.mode == "LAB":
-        raise UnknownPixelsError(f"pixels of the kind {image.mode} aren't RGB")
+        raise UnknownPixelsError(f"pixels of the kind {image.mode}, which aren't RGB")
     return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
 
 

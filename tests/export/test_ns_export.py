@@ -1,9 +1,14 @@
-"""nerfstudio's own exporters of points and of a Poisson mesh take these runs."""
+"""nerfstudio's own exporters take these runs, and write all of their files or none, and never over others."""
 
 import numpy as np
 import pytest
 from conftest import run_entrypoint
+from interrupted import finish
 from plyfile import PlyData
+
+from sparsestyle_ns.pipelines.command_output import claim_output
+from sparsestyle_ns.pipelines.export_command import check_export
+from sparsestyle_ns.utils.errors import InputError
 
 pytest.importorskip("open3d", exc_type=ImportError, reason="Open3D can't be loaded on this machine")
 
@@ -22,3 +27,87 @@ def test_ns_export_writes_points_and_a_mesh_of_a_stylised_run(what, patterned_ru
     assert len(points) > 500
     # Of the photos' 2,304 pixels one batch of 1,500, drawn with replacement, has 1,100, and two have 1,700.
     assert what == "poisson" or len(np.unique(points, axis=0)) > 1400
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "name"),
+    [
+        ("ExportPointCloud", {}, "point_cloud.ply"),
+        ("ExportTSDFMesh", {"texture_method": "tsdf"}, "tsdf_mesh.ply"),
+        ("ExportTSDFMesh", {}, "mesh.obj"),
+        ("ExportTSDFMesh", {}, "material_0.png"),
+        ("ExportPoissonMesh", {}, "poisson_mesh.ply"),
+        ("ExportPoissonMesh", {"save_point_cloud": True}, "point_cloud.ply"),
+        ("ExportCameraPoses", {}, "transforms_eval.json"),
+    ],
+)
+def test_an_export_never_takes_the_place_of_a_file(kind, settings, name, tmp_path, monkeypatch):
+    from nerfstudio.scripts import exporter
+
+    def claim(folder):
+        claim_output(getattr(exporter, kind)(load_config=None, output_dir=folder, **settings), "exporter")
+
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "notes.txt").touch()
+    claim(tmp_path / "made")  # a folder may have other files
+    (tmp_path / "made" / name).touch()
+    sentence = rf"Something is at --output-dir .*made already \({name}\); take {tmp_path / 'made-2'} or another place"
+    with pytest.raises(InputError, match=sentence):
+        claim(tmp_path / "made")
+    monkeypatch.chdir(tmp_path / "made")
+    with pytest.raises(InputError, match=f"Something is at --output-dir [.] already .* take {tmp_path / 'made-2'} or"):
+        claim(".")
+    claim(tmp_path / "made-2")
+    with pytest.raises(
+        InputError, match=r"can't be written to .*Not a directory.* name another place with --output-dir"
+    ):
+        claim(tmp_path / "made" / "notes.txt")
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "sentence"),
+    [
+        ("ExportGaussianSplat", {}, "sparsestyle export RUN --format splat"),
+        ("ExportMarchingCubesMesh", {}, "ns-export poisson --normal-method open3d"),
+        ("ExportPointCloud", {}, "no normals of its own; add --normal-method open3d"),
+        ("ExportPoissonMesh", {"normal_method": "open3d", "num_points": 0}, "--num-points is 0; give 1 or more"),
+        ("ExportTSDFMesh", {"downscale_factor": 0}, "--downscale-factor is 0; give 1 or more"),
+        ("ExportCameraPoses", {}, None),
+    ],
+)
+def test_an_export_that_cant_be_done_is_refused_before_any_work(kind, settings, sentence, tmp_path):
+    from nerfstudio.scripts import exporter
+
+    command = getattr(exporter, kind)(load_config=None, output_dir=tmp_path, **settings)
+    if sentence is None:
+        check_export(command)
+        return
+    with pytest.raises(InputError, match=sentence):
+        check_export(command)
+
+
+def test_a_box_that_isnt_whole_is_named(tmp_path, capsys):
+    from nerfstudio.scripts import exporter
+
+    box = {"obb_center": (0.0, 0.0, 0.0), "normal_method": "open3d"}
+    check_export(exporter.ExportPointCloud(load_config=None, output_dir=tmp_path, **box))
+    assert "have an effect only together" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "left"),
+    [
+        ("gaussian-splat --output-dir {tmp}/new/folder", 1, set()),
+        ("pointcloud --normal-method open3d --num-points 100 --depth-output-name foo --output-dir {tmp}/new", 1, set()),
+        ("cameras --output-dir {tmp}/taken/new", 1, set()),
+        ("cameras --output-dir {tmp}/new", 0, {"new", "transforms_train.json", "transforms_eval.json"}),
+    ],
+)
+def test_an_export_leaves_its_files_or_nothing(words, status, left, runs, tmp_path):
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "taken").touch()
+    command = ["ns-export", *words.format(tmp=tmp_path / "made").split()]
+    ending = finish([*command, "--load-config", runs.style / "config.yml"], tmp_path / "log")
+    assert ending.status == status, ending.printed[-3000:]
+    assert "Traceback" not in ending.printed
+    assert {path.name for path in (tmp_path / "made").rglob("*")} == {"taken", *left}

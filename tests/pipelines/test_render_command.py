@@ -19,9 +19,10 @@ from nerfstudio.scripts import render
 from PIL import Image
 
 from sparsestyle_ns.pipelines import nerfstudio_options as options
+from sparsestyle_ns.pipelines.command_output import claim_output
 from sparsestyle_ns.pipelines.render_command import find_ends, read_camera_path
-from sparsestyle_ns.pipelines.render_files import all_or_nothing, claim_output
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import all_or_nothing
 
 CAMERA = {"camera_to_world": np.eye(4).flatten().tolist(), "fov": 50, "aspect": 1}
 CROP = {
@@ -173,7 +174,7 @@ def test_an_option_without_effect_is_named_where_it_is_given():
 
 def rendering(**settings):
     command = render.RenderInterpolated(load_config=None, **settings)
-    claim_output(command)
+    claim_output(command, "render")
     return str(command.output_path)
 
 
@@ -206,7 +207,7 @@ def test_pictures_of_views_never_mix_with_those_of_another_run(tmp_path, monkeyp
         ({"rendered_output_names": ["depth"]}, "renders"),
     ):
         command = render.DatasetRender(load_config=None, **settings)
-        claim_output(command)
+        claim_output(command, "render")
         assert str(command.output_path) == expected
 
 
@@ -215,7 +216,7 @@ def test_a_folder_of_ones_own_isnt_taken_for_a_films_own(tmp_path):
     (tmp_path / "film_temp" / "mine").touch()
     command = render.RenderCameraPath(load_config=None, output_path=tmp_path / "film.mp4")
     with pytest.raises(InputError, match="Something is at"):
-        claim_output(command)
+        claim_output(command, "render")
 
 
 @pytest.mark.parametrize("ends_well", [True, False])

@@ -18,6 +18,8 @@ from photo_sets import (
     write_transforms,
 )
 from PIL import ExifTags, Image
+from test_commands import write_ring
+from test_commands import write_transforms as write_capture
 
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
@@ -298,6 +300,49 @@ def test_a_folder_with_something_in_it_is_left_alone(tmp_path):
     with pytest.raises(InputError, match="is there already"):
         prepare_scene(tmp_path / "photos", tmp_path / "scene")
     assert [path.name for path in (tmp_path / "scene").iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize("name", ["photos", "photos/inside", "photos/new/scene", "linked/inside"])
+def test_a_scene_is_never_written_into_the_folder_of_the_photos(tmp_path, name):
+    write_photos(tmp_path / "photos")
+    write_poses_bounds(tmp_path / "photos")
+    (tmp_path / "linked").symlink_to(tmp_path / "photos")
+    (tmp_path / "photos-scene").touch()
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "photos").rglob("*")}
+    with pytest.raises(InputError, match=f"only read; take {tmp_path / 'photos-scene-2'} or another place outside"):
+        prepare_scene(tmp_path / "photos", tmp_path / name)
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "photos").rglob("*")} == before
+    assert prepare_scene(tmp_path / "photos", tmp_path / "photos-scene-2").names
+
+
+def test_a_place_that_cant_be_written_to_is_said_before_photos_are_read(tmp_path):
+    (tmp_path / "photos").mkdir()  # without any
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"The scene can't be written to .* name another place with --output\."):
+        prepare_scene(tmp_path / "photos", tmp_path / "file" / "scene")
+
+
+def test_photos_without_a_frame_and_frames_without_a_photo_are_named(tmp_path, capsys):
+    write_capture(tmp_path, write_ring(tmp_path))
+    for old, new in (("2.png", "other.png"), ("4.png", "more.png")):
+        (tmp_path / "images" / old).rename(tmp_path / "images" / new)
+    assert len(prepare_scene(tmp_path, tmp_path.with_name("made")).names) == 4
+    printed = capsys.readouterr().out
+    assert "whose photos aren't there, and are left out: images/2.png, images/4.png\n" in printed
+    assert "which are left out: more.png, other.png\n" in printed
+
+
+def test_a_link_that_leads_nowhere_is_no_photo_that_one_passes_over(tmp_path):
+    write_photos(tmp_path / "photos")
+    (tmp_path / "photos" / "link.jpg").symlink_to("nowhere.jpg")
+    with pytest.raises(InputError, match=r"link\.jpg is a link that leads nowhere; put the photo there"):
+        prepare_scene(tmp_path / "photos", tmp_path / "scene")
+
+
+def test_a_file_that_is_no_video_is_called_so(tmp_path):
+    (tmp_path / "photo.jpg").touch()
+    with pytest.raises(InputError, match=r"photo\.jpg is a file, and no video; name the folder"):
+        prepare_scene(tmp_path / "photo.jpg", tmp_path / "scene")
 
 
 def test_poses_are_asked_of_a_file_that_is_not_there(tmp_path):

@@ -240,6 +240,7 @@ def test_the_last_line_names_the_report_and_trains_on_the_scene(tmp_path, monkey
     (tmp_path / "poses_bounds.npy").touch()
     report = SimpleNamespace(
         write=lambda folder: folder / "index.html",
+        measured=["a curve"],
         recommendation=["Take 4."],
         everything_left_out=lambda: [],
         left_out=[],
@@ -252,6 +253,21 @@ def test_the_last_line_names_the_report_and_trains_on_the_scene(tmp_path, monkey
     train = f"ns-train coarse-fewshot-draft --num-views 4 --max-image-side 64 --data {tmp_path} llff-data"
     last = f"Made {tmp_path / 'index.html'} – next: {train} --eval-interval 4"
     assert capsys.readouterr().out.splitlines() == ["Take 4.", last]
+
+
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        ([], "Error: Nothing could be measured in the time there was; give a larger --budget."),
+        (["--groups", "style"], "Error: Nothing could be measured: Style (stage 2): there is no painting; name one"),
+    ],
+)
+def test_where_nothing_is_measured_there_is_no_report(llff_scene, tmp_path, flags, sentence):
+    command = ["tradeoff", "--data", str(llff_scene), "--budget", "0.1s", "--output-dir", str(tmp_path / "a" / "b")]
+    with pytest.raises(SystemExit) as ended:
+        main([*command, *flags])
+    assert ended.value.code.startswith(sentence)
+    assert not list(tmp_path.iterdir())
 
 
 def test_options_become_the_study(tmp_path):

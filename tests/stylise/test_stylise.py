@@ -224,6 +224,14 @@ def test_what_cannot_be_used_is_refused_at_once(photos, painting, monkeypatch, c
         stylise(monkeypatch, Path(given["photos"]), given["painting"], "--seed", str(given["seed"]))
 
 
+def test_nothing_is_made_in_the_folder_of_the_photos(photos, painting, monkeypatch):
+    monkeypatch.setattr(stages_module, "run_command", lambda *_: pytest.fail("a stage was begun"))
+    before = sorted(photos.rglob("*"))
+    with pytest.raises(SystemExit, match="is in the folder of the photos, which are only read; take "):
+        stylise(monkeypatch, photos, painting, "--output", str(photos / "made"))
+    assert sorted(photos.rglob("*")) == before
+
+
 @pytest.mark.parametrize("content", [b"", b"not a picture"])
 def test_a_painting_that_cannot_be_read_is_refused_before_the_first_stage(photos, tmp_path, monkeypatch, content):
     bad = tmp_path / "bad.png"
