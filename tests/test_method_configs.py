@@ -37,11 +37,22 @@ def test_stage_1_learns_matrices_with_muon_and_all_else_with_adam_both_slower_an
 
 
 @pytest.mark.parametrize("variant", ["", "-draft"])
-def test_stage_2_goes_from_half_size_to_the_photos(variant):
+def test_stage_2_goes_from_126_to_252_pixels_whatever_the_photos_are(variant):
     config = method_config(f"hier-style{variant}")
     small, large = config.pipeline.levels(config.max_num_iterations)
-    assert (small.scale, large.scale) == (0.5, 1.0)
-    assert small.length > large.length > 0 and small.length + large.length == config.max_num_iterations
+    assert small.length >= large.length > 0 and small.length + large.length == config.max_num_iterations
+    for photo_side in (252, 504, 1008):
+        sides = [photo_side * config.pipeline.share_of_photos(level.scale, photo_side) for level in (small, large)]
+        seen = [config.pipeline.side_at(level.scale, photo_side) for level in (small, large)]
+        assert sides == pytest.approx([126, 252]) and seen == [126, 252]
+
+
+def test_views_are_as_much_larger_as_strokes_are_finer_up_to_the_photos_size():
+    for stroke_size, side, seen in ((0.5, 504, 504), (0.7, 360, 360), (2.0, 252, 126)):
+        config = replace(method_config("hier-style").pipeline, stroke_size=stroke_size)
+        assert 1008 * config.share_of_photos(1.0, 1008) == pytest.approx(side)
+        assert config.side_at(1.0, 1008) == seen
+        assert config.share_of_photos(1.0, 200) == 1.0
 
 
 def test_the_papers_stage_1_has_50_000_iterations_of_adam_at_a_constant_rate():

@@ -53,7 +53,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     """Shares of the iterations at these sizes."""
     stroke_size: Annotated[float, tyro.conf.arg(aliases=("--stroke-size",))] = 1.0
     """How wide strokes are, from 0.5 to 2: the feature network sees views and painting in this many times smaller
-    pictures, where its patches are as many times wider. 0.5 takes four times the network's time and memory."""
+    pictures, where its patches are as many times wider. 0.5 takes about four times the time and memory."""
     feature_side: Optional[int] = None
     """Longer side, in pixels, at which the network sees the largest views where strokes are of size 1. None: that of
     the views."""
