@@ -63,6 +63,8 @@ class Work:
             names = {field.name for field in dataclasses.fields(pipeline)}
             if "view_scales" in names:  # all at the photos' size
                 pipeline.view_scales = pipeline.scale_shares = (1.0,)
+            if "view_side" in names:
+                pipeline.view_side = None
             if self.task["quick"]:
                 pipeline.model.log2_table_size, pipeline.model.occupancy_resolution = 12, 16
                 pipeline.feature_side = 64
