@@ -34,7 +34,7 @@ def peak_of_steps(options: MemoryOptions, scene: Scene, coarse_run: Path, side: 
     config.pipeline.cache_gigabytes = options.cache_gigabytes
     config.pipeline.warm_start_steps = 1
     training = Training(config, device, coarse.model_state())
-    training.num_steps = training.pipeline.task.levels[-1].schedule.first  # those at the photos' size take most
+    training.num_steps = training.pipeline.task.levels[-1].schedule.first  # the largest views take most
     for _ in range(options.steps):
         training.step()
     frozen = [view.frozen for view in training.pipeline.scene_views.views]
