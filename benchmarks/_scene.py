@@ -164,7 +164,7 @@ def style_config(scene: Scene, coarse: CoarseRun, longer_side: int, options: Opt
     pipeline.model.fine_encoding = "hash"  # the plain way gets the same tables
     pipeline.model.coarse_field = copy.deepcopy(coarse.config.pipeline.model.coarse_field)
     if only_whole:
-        pipeline.view_side, pipeline.view_scales, pipeline.scale_shares = None, (1.0,), (1.0,)
+        pipeline.view_side, pipeline.view_scales, pipeline.scale_shares = "photos", (1.0,), (1.0,)
     if options.quick:
         pipeline.feature_side, pipeline.warm_start_steps = 64, 1
         pipeline.model.log2_table_size, pipeline.model.occupancy_resolution = 12, 16

@@ -64,7 +64,7 @@ class Work:
             if "view_scales" in names:  # all at the photos' size
                 pipeline.view_scales = pipeline.scale_shares = (1.0,)
             if "view_side" in names:
-                pipeline.view_side = None
+                pipeline.view_side = "photos"
             if self.task["quick"]:
                 pipeline.model.log2_table_size, pipeline.model.occupancy_resolution = 12, 16
                 pipeline.feature_side = 64

@@ -148,7 +148,7 @@ hier_style_paper = variant(
         "coarse_method": coarse_fewshot_paper_config,
         "max_num_iterations": 200,
         "pipeline.effects": EffectSettings(view_color="on", matched_depth="off", residual_density="on", palette="off"),
-        "pipeline.view_side": None,
+        "pipeline.view_side": "photos",
         "pipeline.view_scales": (1.0,),
         "pipeline.scale_shares": (1.0,),
         "pipeline.content_share": 0.5,

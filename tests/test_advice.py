@@ -500,7 +500,7 @@ TABLE = [
         lambda place: goes_on("--max-num-iterations 4", place),
     ),
     # Settings of stage 2
-    Advice("--pipeline.view-side is ", style("--pipeline.view-side 0"), style("--pipeline.view-side None")),
+    Advice("--pipeline.view-side is ", style("--pipeline.view-side 0"), style("--pipeline.view-side photos")),
     Advice("--pipeline.object-style is ", style("--pipeline.object-style 0"), style("--pipeline.object-style 1")),
     Advice(
         "--pipeline.model.object-cells is ",

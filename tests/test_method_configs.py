@@ -55,6 +55,13 @@ def test_views_are_as_much_larger_as_strokes_are_finer_up_to_the_photos_size():
         assert config.share_of_photos(1.0, 200) == 1.0
 
 
+@pytest.mark.parametrize(("view_side", "side"), [("photos", 1008), (300, 300), ("auto", 252)])
+def test_views_have_the_side_that_is_asked_for(view_side, side):
+    config = replace(method_config("hier-style").pipeline, view_side=view_side)
+    assert 1008 * config.share_of_photos(1.0, 1008) == pytest.approx(side)
+    assert config.side_at(1.0, 1008) == side and config.side_at(0.5, 1008) == side // 2
+
+
 def test_the_papers_stage_1_has_50_000_iterations_of_adam_at_a_constant_rate():
     config = method_config("coarse-fewshot-paper")
     assert config.max_num_iterations == 50_000

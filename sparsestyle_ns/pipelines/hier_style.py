@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Callable, Dict, List, NamedTuple, Optional, Tuple, Type
+from typing import Annotated, Any, Callable, Dict, List, Literal, NamedTuple, Optional, Tuple, Type, Union
 
 import torch
 import tyro
@@ -26,6 +26,8 @@ from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress import say
 
+USUAL_VIEW_SIDE = 252
+"""Longer side, in pixels, of the views of a whole scene that are stylised."""
 STROKE_SIZES = (0.5, 2.0)
 """The smallest and the largest."""
 
@@ -42,10 +44,11 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     coarse_run: Annotated[Optional[Path], tyro.conf.arg(aliases=("--coarse-run",))] = None
     """Folder or config.yml of the coarse-fewshot run to stylise. None: the newest finished one that matches the data
     and its settings, and where there is none it is trained first."""
-    view_side: Optional[int] = 252
-    """Longer side, in pixels, of the views that are stylised, where photos are larger; with strokes finer than 1 as many
-    times more. Pictures are of any size all the same. In larger views the style loss makes ripples as fine as bristles,
-    finer than the geometry of few photos can hold together. None: the photos' size."""
+    view_side: Union[int, Literal["auto", "photos"]] = "auto"
+    """Longer side, in pixels, of the views that are stylised, where photos are larger; as many times more as strokes
+    are finer than 1. Pictures are of any size all the same. auto: 252, and for an object on a background the photos'
+    size. In larger views the style loss makes ripples as fine as bristles, finer than what few photos of a whole scene
+    agree on; an object, seen from all around, holds more."""
     view_scales: Tuple[float, ...] = (0.5, 1.0)
     """Sizes at which the views are stylised, one after another, as shares of `view_side`; the last is the one that
     counts, and iterations before it are quick."""
@@ -96,8 +99,8 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
                 raise InputError(f"--pipeline.loss-weights names {name}, which is no loss; the losses are {known}.")
             if not 0.0 <= weight < math.inf:
                 raise InputError(f"--pipeline.loss-weights.{name} is {weight}; give a finite number, 0 or more.")
-        if self.view_side is not None and self.view_side < 1:
-            raise InputError(f"--pipeline.view-side is {self.view_side}; give a number of pixels, or None.")
+        if isinstance(self.view_side, int) and self.view_side < 1:
+            raise InputError(f"--pipeline.view-side is {self.view_side}; give a number of pixels, auto, or photos.")
         if not 0.0 < self.object_style < math.inf:
             raise InputError(f"--pipeline.object-style is {self.object_style}; give a number above 0.")
         if not any(self.loss_weights.values()):
@@ -114,13 +117,17 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
 
     def share_of_photos(self, scale: float, photo_side: int) -> float:
         """What views at one of the `view_scales` have of the longer side of their photos, at most 1."""
-        finest = (self.view_side or photo_side) / min(1.0, self.stroke_size)
-        return scale * min(1.0, finest / photo_side)
+        return scale * min(1.0, self._largest_side(photo_side) / min(1.0, self.stroke_size) / photo_side)
 
     def side_at(self, scale: float, photo_side: int) -> int:
         """Longer side, in pixels, at which the network sees views at one of the `view_scales`, and the painting."""
-        largest = self.feature_side or min(photo_side, self.view_side or photo_side)
+        largest = self.feature_side or min(photo_side, self._largest_side(photo_side))
         return max(1, round(scale * largest / self.stroke_size))
+
+    def _largest_side(self, photo_side: int) -> int:
+        if isinstance(self.view_side, int):
+            return self.view_side
+        return photo_side if self.view_side == "photos" else USUAL_VIEW_SIDE
 
     def targets_of(
         self, painting: Painting, backbone: Backbone, device: torch.device, photo_side: int, scale: float = 1.0
@@ -179,6 +186,11 @@ class HierStylePipeline(CheckedPipeline):
     """What this run trains, once it is set up."""
     on_losses: Optional[Callable[[int, Losses], None]] = None
     """Told of each iteration and its losses, by a viewer that shows them."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        if self.config.view_side == "auto" and self.model.background is not None:
+            self.config.view_side = "photos"
 
     def new_task(
         self,
