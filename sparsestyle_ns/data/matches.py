@@ -9,7 +9,7 @@ those of blurred photos, so that a match that is off by a fraction of a pixel do
 """
 
 from dataclasses import dataclass
-from typing import List, Optional, Sequence
+from typing import List, Optional, Sequence, Tuple
 
 import cv2
 import numpy as np
@@ -43,12 +43,20 @@ class PointMatches:
         colors: RGB there, in [0, 1].
         directions: unit vectors in the world, from the cameras to the point.
         num_views: photos in all.
+        num_sure: how many of them, the first ones, stand out among all features; None: all. Of the others, which stand
+            out along epipolar lines alone, some are chance: few enough for depths, too many to judge colours by.
     """
 
     views: Int[np.ndarray, "2 matches"]
     colors: Float[np.ndarray, "2 matches 3"]
     directions: Float[np.ndarray, "2 matches 3"]
     num_views: int
+    num_sure: Optional[int] = None
+
+    def sure(self) -> "PointMatches":
+        """Those that stand out among all features."""
+        parts = (part[:, : self.num_sure] for part in (self.views, self.colors, self.directions))
+        return PointMatches(*parts, num_views=self.num_views)
 
     def __len__(self) -> int:
         return self.views.shape[1]
@@ -97,13 +105,16 @@ def match_points(
     """
     poses = cameras.camera_to_worlds.double().numpy()
     pairs = _neighbouring_pairs(poses)
-    features = [find_features(_grey(photo)) for photo in photos] if tracks is None else []
-    found = tracks.matches(names, [photo.shape[1::-1] for photo in photos]) if tracks else match_photos(features, pairs)
+    if tracks is None:
+        features = [find_features(_grey(photo)) for photo in photos]
+        found = match_photos(features, pairs)
+    else:
+        features, found = [], tracks.matches(names, [photo.shape[1::-1] for photo in photos])
     seen = [
         _look_at(photo, points, cameras, index)
         for index, (photo, points) in enumerate(zip(photos, found.points, strict=True))
     ]
-    views, colors, directions = [np.zeros((2, 0), int)], [np.zeros((2, 0, 3))], [np.zeros((2, 0, 3))]
+    sure, others = _Found(seen), _Found(seen)
     for pair in pairs:
         both = [seen[index] for index in pair]
         if None in both:
@@ -112,17 +123,36 @@ def match_points(
         most = MAX_EPIPOLAR_ERROR * max(view.pixel for view in both)
         error = epipolar_error(*(view.rays[row] for view, row in zip(both, rows, strict=True)), *between)
         rows = rows[:, error < most]
+        sure.add(pair, rows)
         if features and rows.shape[1] >= MIN_LINKING:
             allowed = near_epipolar_lines(*(view.rays for view in both), *between, most)
-            rows = np.stack(mutual_matches(*(features[index].descriptors for index in pair), allowed=allowed))
-        matched = list(zip(both, rows, strict=True))
+            more = np.stack(mutual_matches(*(features[index].descriptors for index in pair), allowed=allowed))
+            is_new = ~np.isin(more[0], rows[0]) & ~np.isin(more[1], rows[1])
+            others.add(pair, more[:, is_new])
+    parts = (np.concatenate([*ours, *theirs], axis=1) for ours, theirs in zip(sure.parts, others.parts, strict=True))
+    return PointMatches(*parts, num_views=len(photos), num_sure=sum(part.shape[1] for part in sure.parts[0]))
+
+
+class _Found:
+    """Matches of photos' features, as `PointMatches` has them; only where both photos are opaque."""
+
+    def __init__(self, seen: Sequence[Optional[_View]]) -> None:
+        self.seen = seen
+        self.parts: Tuple[List[np.ndarray], ...] = (
+            [np.zeros((2, 0), int)],
+            [np.zeros((2, 0, 3))],
+            [np.zeros((2, 0, 3))],
+        )
+
+    def add(self, pair: Pair, rows: Int[np.ndarray, "2 matches"]) -> None:
+        """Adds matches of two photos: which feature of the one is which of the other."""
+        matched = list(zip((self.seen[index] for index in pair), rows, strict=True))
         rgba = np.stack([view.rgba[row] for view, row in matched])
         good = (rgba[..., 3] > 0.99).all(axis=0)
+        views, colors, directions = self.parts
         views.append(np.repeat(np.array(pair)[:, None], good.sum(), axis=1))
         colors.append(rgba[:, good, :3])
         directions.append(np.stack([view.directions[row[good]] for view, row in matched]))
-    joined = (np.concatenate(parts, axis=1) for parts in (views, colors, directions))
-    return PointMatches(*joined, num_views=len(photos))
 
 
 def _grey(photo: Float[np.ndarray, "H W 4"]) -> UInt8[np.ndarray, "H W"]:

@@ -52,7 +52,7 @@ def fit_gains(matches: PointMatches) -> Tuple[Float[np.ndarray, "views 3"], Floa
 
 def not_measurable(scene: Scene) -> Optional[str]:
     """Why photos' colours can't be compared by matched points, in words; None where they can."""
-    fewest = scene.matches.fewest_in_a_view()
+    fewest = scene.sure_matches.fewest_in_a_view()
     if fewest >= MIN_MATCHES:
         return None
     reason = why_unmatched(scene.cameras) or f"a photo has {fewest} matched points, fewer than {MIN_MATCHES}"
@@ -96,9 +96,9 @@ def measure_exposure(scene: Scene) -> Measurement:
     unknown = not_measurable(scene)
     if unknown:
         return Measurement(False, unknown, None, MIN_STOPS)
-    gains, _ = fit_gains(scene.matches)
+    gains, _ = fit_gains(scene.sure_matches)
     stops = float(np.abs(gains).max() / np.log(2.0))
-    words = f"stops at most between a photo and the mean, by {len(scene.matches)} matched points"
+    words = f"stops at most between a photo and the mean, by {len(scene.sure_matches)} matched points"
     return Measurement(stops >= MIN_STOPS, words, stops, MIN_STOPS)
 
 
@@ -107,7 +107,7 @@ def measure_view_color(scene: Scene) -> Measurement:
 
     On, the coarse field's colour head sees the view direction, as in Eq. 1.
     """
-    matches, unknown = scene.matches, not_measurable(scene)
+    matches, unknown = scene.sure_matches, not_measurable(scene)
     if unknown:
         return Measurement(False, unknown, None, MIN_SHARE)
     _, unexplained = fit_gains(matches)

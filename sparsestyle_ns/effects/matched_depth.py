@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestyle_ns.core.triangulation import distances_to_meeting
-from sparsestyle_ns.data.matches import why_unmatched
+from sparsestyle_ns.data.matches import PointMatches, why_unmatched
 from sparsestyle_ns.effects.decisions import Decisions, Measurement
 from sparsestyle_ns.effects.scene import Scene
 
@@ -32,9 +32,12 @@ class MatchedRays:
         return len(self.origins)
 
 
-def triangulate(scene: Scene) -> MatchedRays:
-    """Two rays, one from each camera, for each point that two photos share: where they come nearest, if before both."""
-    matches, poses = scene.matches, scene.cameras.camera_to_worlds.double()
+def triangulate(scene: Scene, matches: Optional[PointMatches] = None) -> MatchedRays:
+    """Two rays, one from each camera, for each point that two photos share: where they come nearest, if before both.
+
+    Of all the scene's matches, or of these of them.
+    """
+    matches, poses = scene.matches if matches is None else matches, scene.cameras.camera_to_worlds.double()
     views = torch.tensor(scene.matched_views)[torch.from_numpy(matches.views)]
     origins, directions = poses[views][..., 3], torch.from_numpy(matches.directions)
     distances = distances_to_meeting(origins, directions)

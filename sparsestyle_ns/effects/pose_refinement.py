@@ -32,7 +32,7 @@ def measure_pose_refinement(scene: Scene) -> Measurement:
     unknown = not_measurable(scene)
     if unknown:
         return Measurement(False, unknown, None, MAX_MISS)
-    rays = triangulate(scene)
+    rays = triangulate(scene, scene.sure_matches)
     miss = float(miss_in_pixels(rays.origins.view(2, -1, 3), rays.directions.view(2, -1, 3), scene.cameras).median())
     whose = "estimated" if scene_info(scene.outputs).poses_estimated else "known"
     words = f"pixels by which rays to {len(rays) // 2} matched points miss each other (median); poses are {whose}"

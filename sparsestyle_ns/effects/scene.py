@@ -80,6 +80,11 @@ class Scene:
         tracks = None if info is None else info.tracks
         return match_points([self.photos[index] for index in chosen], cameras, names, tracks)
 
+    @cached_property
+    def sure_matches(self) -> PointMatches:
+        """Those of them by which colours and cameras can be judged."""
+        return self.matches.sure()
+
     @property
     def matched_views(self) -> List[int]:
         """Photos among which points are matched: at most `MATCHED_VIEWS`, evenly spaced."""

@@ -43,6 +43,9 @@ def tradeoff(options: TradeoffOptions) -> None:
     study, options = study_of(options), replace(options, output_dir=report_folder(options.output_dir, options.force))
     files = [options.output_dir / name for name in FILES]
     with all_or_nothing([path for path in files if not path.exists()]):
+        with writing_to(options.output_dir):  # known before anything is measured
+            options.output_dir.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=options.output_dir).close()
         report = _measured(study, options, Budget(budget_seconds))
         page = report.write(options.output_dir)
     lines, left_out = report.recommendation, report.everything_left_out()
@@ -79,9 +82,6 @@ def study_of(options: TradeoffOptions) -> Study:
 
 def measure(study: Study, options: TradeoffOptions, budget: Budget) -> Report:
     """Measures what fits into the budget; Ctrl-C ends it, and what has been measured is in the report."""
-    with writing_to(options.output_dir):  # known before anything is measured
-        options.output_dir.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=options.output_dir).close()
     seconds, stopped = budget.left, []
     # The lines and warnings of nerfstudio and of the methods stay away from the terminal.
     quiet = altered(CONSOLE, quiet=True), altered(rich.get_console(), quiet=True)

@@ -54,7 +54,8 @@ def all_or_nothing(paths: List[Path]) -> Iterator[None]:
     def take_away() -> None:
         for path in unfinished:
             for part in path.iterdir() if path.is_dir() else [path]:
-                shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
+                with suppress(FileNotFoundError, NotADirectoryError):  # never made: a file may be in its folder's place
+                    shutil.rmtree(part) if part.is_dir() else part.unlink()
         for folder in sorted(folders, key=lambda folder: len(folder.parts), reverse=True) if unfinished else ():
             with suppress(OSError):  # never made, or somebody else has put something there
                 folder.rmdir()

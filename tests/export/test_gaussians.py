@@ -125,7 +125,7 @@ def seen(small, index):
     rays = len(segments.hit)
     s = torch.linspace(0.0, 1.0, 65)[:-1] + 1 / 128
     points = segments.positions(s.expand(rays, -1))
-    codes = small.voxels.interpolate(points.reshape(-1, 3)).view(rays, -1, 4)
+    codes = small.voxels.styles[0].interpolate(points.reshape(-1, 3)).view(rays, -1, 4)
     depth = 0.01 * torch.expm1(math.log1p(1e7) / 254 * (codes[..., 0] - 1.0))
     depth = depth * segments.lengths(torch.linspace(0.0, 1.0, 65).expand(rays, -1)) * segments.hit[:, None]
     light = torch.exp(-torch.cat([torch.zeros(rays, 1), depth.cumsum(-1)[:, :-1]], dim=-1))

@@ -72,7 +72,7 @@ def test_each_ablation_of_the_paper_is_a_run_and_none_is_done_twice(painting: Pa
     assert set(names) == framework | {f"ours-{kind}" for kind in STYLE_KINDS}
     assert {run.name for run in needed_runs(paper_runs(), [OF_METHODS], [painting])} <= {run.name for run in found}
     assert {run.pictures for run in found} == {(20, 80)}
-    assert {run.pictures for run in ablation_runs(paper_runs(draft=False), painting)} == {(20, 100, 200)}
+    assert {run.pictures for run in ablation_runs(paper_runs(draft=False), painting)} == {(20, 100, 400)}
     assert {run.pictures for run in ablation_runs(paper_runs(style_iterations=50), painting)} == {(20, 50)}
 
 

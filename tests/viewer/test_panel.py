@@ -448,7 +448,7 @@ def test_a_painting_called_nothing_is_blended_in_only_when_it_is_chosen(
 def render(run: Path, output: Path) -> None:
     from nerfstudio.scripts import render
 
-    flags = ["--camera-path-filename", str(write_camera_path(output)), "--output-format", "images"]
+    flags = ["--camera-path-filename", str(write_camera_path(output.parent)), "--output-format", "images"]
     arguments = ["camera-path", "--load-config", str(run / "config.yml"), "--output-path", str(output), *flags]
     run_entrypoint(render.entrypoint, arguments)
 
