@@ -3,6 +3,7 @@
 import itertools
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -11,7 +12,15 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
 from sparsestyle_ns.data.features import mutual_matches
 from sparsestyle_ns.data.llff import LLFFDataParserConfig
-from sparsestyle_ns.data.matches import LENSES, PointMatches, epipolar_error, rays_of, sample, undistorted
+from sparsestyle_ns.data.matches import (
+    LENSES,
+    PointMatches,
+    epipolar_error,
+    near_epipolar_lines,
+    rays_of,
+    sample,
+    undistorted,
+)
 from sparsestyle_ns.data.reading import read_scene
 from sparsestyle_ns.effects.lens_distortion import largest_shift, measure_lens_distortion
 from sparsestyle_ns.effects.matched_colors import fit_gains, measure_exposure, measure_view_color
@@ -201,3 +210,14 @@ def test_a_photo_that_cant_be_read_is_named(tmp_path):
     (tmp_path / "photo.png").write_text("no picture")
     with pytest.raises(InputError, match=r"photo\.png"):
         read_rgba(tmp_path / "photo.png")
+
+
+def test_points_near_each_others_epipolar_lines_are_those_of_a_small_epipolar_error():
+    random = np.random.default_rng(0)
+    first, second = (rays_of(random.uniform(-0.5, 0.5, (count, 2)), CameraType.PERSPECTIVE) for count in (30, 40))
+    poses = [np.concatenate([cv2.Rodrigues(random.normal(0, 0.2, 3))[0], random.normal(0, 1, (3, 1))], 1) for _ in "ab"]
+    near = near_epipolar_lines(first, second, *poses, 0.05)
+    rows, others = (index.ravel() for index in np.indices(near.shape))
+    error = epipolar_error(first[rows], second[others], *poses)
+    assert 0 < near.sum() < near.size
+    assert np.array_equal(near.ravel(), error < 0.05)
