@@ -157,6 +157,7 @@ hier_style_paper = variant(
         "pipeline.model.min_resolution": 128,
         "pipeline.model.max_resolution": 512,
         "pipeline.model.object_cells": 1.0,
+        "pipeline.model.depth_cells": 1.0,
         "pipeline.warm_start_steps": 0,
         "pipeline.thinning": 0.0,
         "optimizers": {"fields": adam(5e-3, ShareSchedulerConfig(milestones=(0.25, 0.5)))},

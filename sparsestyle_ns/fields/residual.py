@@ -11,6 +11,7 @@ from sparsestyle_ns.field_components.blocked_mlp import blocked_mlp
 from sparsestyle_ns.field_components.hash_grid import GridLocation
 from sparsestyle_ns.field_components.positional_encoding import PointEncoding
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
+from sparsestyle_ns.utils.machine import numbers_on
 
 
 class _NonNegative(torch.autograd.Function):
@@ -46,6 +47,8 @@ class ResidualField(nn.Module):
         density_scale: the MLP's density output is multiplied by this, so that one optimiser step moves σ' by an amount
             that matters beside σ_c (densities are per cube half-side: a surface has some hundreds).
         with_density: whether σ' exists; without it the geometry is the coarse field's.
+        stretch: what each axis of the field coordinates is multiplied by before it is encoded, from 0 to 1: ψ has as
+            much fewer cells along it, and none along an axis of 0.
     """
 
     def __init__(
@@ -56,9 +59,10 @@ class ResidualField(nn.Module):
         layer_width: int = 256,
         density_scale: float = 1.0,
         with_density: bool = True,
+        stretch: Tuple[float, float, float] = (1.0, 1.0, 1.0),
     ) -> None:
         super().__init__()
-        self.grid = grid
+        self.grid, self.stretch = grid, stretch
         self.density_scale = density_scale
         self.mlp = MLP(
             in_dim=grid.get_out_dim() + feature_dim,
@@ -76,7 +80,8 @@ class ResidualField(nn.Module):
 
     def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
         """Where field coordinates in [−1, 1]³ lie in the encoding's cube."""
-        return self.grid.locate(0.5 * (positions + 1.0))
+        stretch = numbers_on(self.stretch, positions.device, positions.dtype)
+        return self.grid.locate(0.5 * (positions * stretch + 1.0))
 
     def forward(
         self, location: GridLocation, feature: Float[Tensor, "points feature"], coarse_density: Float[Tensor, "points"]

@@ -86,7 +86,7 @@ class HierStyleModel(SceneModel):
         for part in (self.exposure, self.refinement):
             if part is not None:
                 part.requires_grad_(False)
-        for name in ("strength", "geometry_strength"):
+        for name in ("strength", "geometry_strength", "depth_cells"):
             if not 0.0 <= (value := getattr(config, name)) <= 1.0:
                 flag = name.replace("_", "-")
                 raise InputError(f"--pipeline.model.{flag} is {value}; give a number from 0 to 1.")
@@ -107,7 +107,7 @@ class HierStyleModel(SceneModel):
     def new_style(self) -> StylisedField:
         """A field to be stylised, as it is before training, on the coarse field's device."""
         with_density, is_object = self.effects.on("residual_density"), self.background is not None
-        new = self.config.new_field(self.field, with_density, is_object, self._built_for())
+        new = self.config.new_field(self.field, with_density, is_object, self.effects.on("ndc"), self._built_for())
         return new.to(next(self.field.parameters()).device)
 
     def _built_for(self) -> torch.device:

@@ -1,11 +1,12 @@
 """A few samples a ray where its weight is, in place of all its steps; each stands for a stretch of its ray.
 
 The geometry of a frozen field never changes, so its density is measured once, in a volume (`DensityVolume`). A ray is
-cut into stretches of equal weight, by what the volume shows on even steps, and each is sampled where half of its weight
-lies. There the field itself is evaluated, and corrects the volume: a stretch of optical depth τ̂ by the volume has
-τ = τ̂ σ_c/σ̂, with both densities at its sample (a control variate: σ̂ is wrong by a factor that hardly changes along a
-stretch). With residual density (Eq. 3) it has τ + σ' L, where L is its length. All of this is exact as stretches become
-short, for which a share of them is spread evenly.
+cut into stretches of about equal weight, by what the volume shows on even steps. Their borders move to where there is
+little weight, so that two surfaces seldom share a stretch, and each is sampled where half of its own weight lies. There
+the field itself is evaluated, and corrects the volume: a stretch of optical depth τ̂ by the volume has τ = τ̂ σ_c/σ̂,
+with both densities at its sample (a control variate: σ̂ is wrong by a factor that hardly changes along a stretch). With
+residual density (Eq. 3) it has τ + σ' L, where L is its length. All of this is exact as stretches become short, for
+which a share of them is spread evenly.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import NamedTuple, Optional, Tuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestyle_ns.core.occupancy import DensityVolume, Occupancy, PackedSamples
@@ -24,12 +25,17 @@ from sparsestyle_ns.core.volrend import dense_weights, optical_depth
 LEAST_WEIGHT = 1e-4
 """Stretches, and rays, with less weight than this have no sample where nothing can be added to them."""
 MOST_CORRECTION = 10.0
-"""A volume's density counts as at most so many times too small or too large."""
+"""A volume's density counts as at most so many times too small."""
 LEAST_EVEN_SHARE = 0.05
 """Of the stretches, so that what the volume has missed is found."""
 
 FINE_STEPS, FINE_EVEN_SHARE = 64, 0.3
 """Steps of the second look at the volume, and which share of them is spread evenly over what is occupied."""
+ROUNDS = 3
+"""In which borders of stretches move to where there is little weight."""
+SHARE_WITHIN = 1e-4
+"""What lies evenly counts so much where a stretch is sampled: one without weight has its sample in the middle. With
+more, samples of stretches that hold two surfaces fall between these, where no view has taught the field a colour."""
 TINY = 1e-9
 
 
@@ -56,7 +62,7 @@ class Stretches(NamedTuple):
         """The stretches' mean σ_c, from σ_c at their samples."""
         lengths = self.samples.lengths
         factor = density / volume.density(self.samples.positions)
-        factor = factor.clamp(1.0 / MOST_CORRECTION, MOST_CORRECTION)
+        factor = factor.clamp(max=MOST_CORRECTION)
         return torch.where(lengths.isinf(), density, factor * self.depth / lengths.clamp(min=1e-12)).to(density)
 
 
@@ -78,14 +84,11 @@ def cut_into_stretches(
     edges = sample_pdf(edges, torch.lerp(_shares(near), _shares(lengths), FINE_EVEN_SHARE) + TINY, FINE_STEPS)
     depth, lengths = _looked_at(segments, edges, few.volume, occupancy)
     share = max(few.even_share, LEAST_EVEN_SHARE)
-    mass = torch.lerp(_shares(dense_weights(depth)), _shares(lengths), share)
-
-    cuts = sample_pdf(edges, mass + TINY, 2 * few.count)
-    borders, s = cuts[:, ::2].contiguous(), cuts[:, 1::2]
-    step = torch.searchsorted(edges, borders, right=True).clamp(1, FINE_STEPS) - 1
-    start = edges.gather(-1, step)
-    part = ((borders - start) / (edges.gather(-1, step + 1) - start).clamp(min=TINY)).clamp(0.0, 1.0)
-    depth, lengths = (_between(values, step, part) for values in (depth, lengths))
+    weights, evenly = _shares(dense_weights(depth)), _shares(lengths)
+    mass = torch.lerp(weights, evenly, share) + TINY
+    place = _place(edges, _gathered(edges, mass, sample_pdf(edges, mass, few.count)))
+    s = _middles(edges, torch.lerp(weights, evenly, SHARE_WITHIN) + TINY, place)
+    depth, lengths = (_at(values, place).diff(dim=-1).clamp(min=0.0) for values in (depth, lengths))
     is_kept = lengths > 0.0
     if few.even_share == 0.0:
         is_kept &= dense_weights(depth) > LEAST_WEIGHT
@@ -115,9 +118,44 @@ def _shares(values: Float[Tensor, "rays steps"]) -> Float[Tensor, "rays steps"]:
     return values / values.sum(dim=-1, keepdim=True).clamp(min=1e-12)
 
 
-def _between(
-    values: Float[Tensor, "rays steps"], step: Tensor, part: Float[Tensor, "rays borders"]
-) -> Float[Tensor, "rays stretches"]:
-    """Sums between neighbouring borders, each a part in [0, 1] into a step."""
+class _Place(NamedTuple):
+    """Where points of rays lie among steps."""
+
+    step: Int[Tensor, "rays points"]
+    part: Float[Tensor, "rays points"]
+    """Of the step, in [0, 1]."""
+
+
+def _place(edges: Float[Tensor, "rays edges"], s: Float[Tensor, "rays points"]) -> _Place:
+    step = torch.searchsorted(edges, s, right=True).clamp(1, edges.shape[-1] - 1) - 1
+    start = edges.gather(-1, step)
+    return _Place(step, ((s - start) / (edges.gather(-1, step + 1) - start).clamp(min=TINY)).clamp(0.0, 1.0))
+
+
+def _at(values: Float[Tensor, "rays steps"], place: _Place) -> Float[Tensor, "rays points"]:
+    """Sums of steps' values up to points."""
     before = F.pad(torch.cumsum(values, dim=-1), (1, 0))
-    return (before.gather(-1, step) + part * values.gather(-1, step)).diff(dim=-1).clamp(min=0.0)
+    return before.gather(-1, place.step) + place.part * values.gather(-1, place.step)
+
+
+def _gathered(
+    edges: Float[Tensor, "rays edges"], mass: Float[Tensor, "rays steps"], borders: Float[Tensor, "rays borders"]
+) -> Float[Tensor, "rays borders"]:
+    """Borders moved to where there is little mass, between two surfaces that would share a stretch (Lloyd 1982)."""
+    moment = mass * 0.5 * (edges[:, 1:] + edges[:, :-1])
+    for _ in range(ROUNDS):
+        place = _place(edges, borders)
+        within, sums = (_at(values, place).diff(dim=-1) for values in (mass, moment))
+        centers = (sums / within.clamp(min=TINY)).clamp(borders[:, :-1], borders[:, 1:])
+        inner = 0.5 * (centers[:, 1:] + centers[:, :-1])
+        borders = torch.cat([borders[:, :1], inner, borders[:, -1:]], dim=-1)
+    return borders
+
+
+def _middles(
+    edges: Float[Tensor, "rays edges"], mass: Float[Tensor, "rays steps"], borders: _Place
+) -> Float[Tensor, "rays stretches"]:
+    """Where half of the mass between neighbouring borders lies."""
+    until = _at(mass, borders)
+    middle = _place(F.pad(torch.cumsum(mass, dim=-1), (1, 0)), 0.5 * (until[:, 1:] + until[:, :-1]))
+    return torch.lerp(edges.gather(-1, middle.step), edges.gather(-1, middle.step + 1), middle.part)

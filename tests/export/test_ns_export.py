@@ -1,13 +1,17 @@
 """nerfstudio's own exporters take these runs, and write all of their files or none, and never over others."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import run_entrypoint
 from interrupted import finish
 from plyfile import PlyData
 
+from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.pipelines.command_output import claim_output
-from sparsestyle_ns.pipelines.export_command import check_export
+from sparsestyle_ns.pipelines.export_command import check_box, check_export
 from sparsestyle_ns.utils.errors import InputError
 
 pytest.importorskip("open3d", exc_type=ImportError, reason="Open3D can't be loaded on this machine")
@@ -94,11 +98,15 @@ def test_a_box_that_isnt_whole_is_named(tmp_path, capsys):
     assert "have an effect only together" in " ".join(capsys.readouterr().out.split())
 
 
+BOX = "--obb-rotation 0 0 0 --obb-scale 1 1 1"
+
+
 @pytest.mark.parametrize(
     ("words", "status", "left"),
     [
         ("gaussian-splat --output-dir {tmp}/new/folder", 1, set()),
         ("pointcloud --normal-method open3d --num-points 100 --depth-output-name foo --output-dir {tmp}/new", 1, set()),
+        (f"pointcloud --normal-method open3d {BOX} --obb-center 90 90 90 --output-dir {{tmp}}/new", 1, set()),
         ("cameras --output-dir {tmp}/taken/new", 1, set()),
         ("cameras --output-dir {tmp}/new", 0, {"new", "transforms_train.json", "transforms_eval.json"}),
     ],
@@ -111,3 +119,21 @@ def test_an_export_leaves_its_files_or_nothing(words, status, left, runs, tmp_pa
     assert ending.status == status, ending.printed[-3000:]
     assert "Traceback" not in ending.printed
     assert {path.name for path in (tmp_path / "made").rglob("*")} == {"taken", *left}
+
+
+@pytest.mark.parametrize("where", [(90.0, 90.0, 90.0), None], ids=["elsewhere", "at the scene"])
+def test_a_box_without_a_surface_is_refused(where, patterned_run, tmp_path):
+    from nerfstudio.scripts import exporter
+
+    pipeline = load_run(patterned_run / "config.yml").pipeline
+    options = {"obb_center": where or (0.0, 0.0, 0.0), "obb_rotation": (0.0, 0.0, 0.0), "obb_scale": (9.0, 9.0, 9.0)}
+    command = exporter.ExportPointCloud(load_config=None, output_dir=tmp_path, **options)
+    if where is None:
+        check_box(command, pipeline)
+        return
+    with pytest.raises(InputError, match=r"holds no surface: none of \d+ rays .* Most end between \(") as refused:
+        check_box(command, pipeline)
+    corners = re.findall(r"\(([^)]*)\)", str(refused.value))
+    low, high = (np.array([float(each) for each in corner.split(", ")]) for corner in corners)
+    assert (low < high).all()
+    check_box(replace(command, obb_center=tuple((low + high) / 2), obb_scale=tuple(high - low)), pipeline)

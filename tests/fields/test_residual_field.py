@@ -121,3 +121,16 @@ def test_the_cube_of_field_coordinates_is_the_unit_cube_of_the_grid(frozen):
     field = residual_field()
     location, expected = field.locate(frozen[0]), field.grid.locate((frozen[0] + 1) / 2)
     assert torch.equal(location.positions, expected.positions)
+
+
+def test_an_axis_that_is_stretched_has_so_many_times_its_cells(frozen):
+    points, feature, density = frozen
+    field, squeezed = residual_field(), residual_field(stretch=(1.0, 1.0, 0.25))
+    moved = points * torch.tensor([1.0, 1.0, 0.25])
+    torch.testing.assert_close(
+        squeezed(squeezed.locate(points), feature, density), field(field.locate(moved), feature, density)
+    )
+    flat = residual_field(stretch=(1.0, 1.0, 0.0))
+    deeper = points * torch.tensor([1.0, 1.0, -0.5])
+    colors = [flat(flat.locate(each), feature, density)[1] for each in (points, deeper)]
+    torch.testing.assert_close(*colors, rtol=0.0, atol=0.0)

@@ -9,6 +9,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.field_components import encodings
 from torch.nn.functional import normalize
 
+from sparsestyle_ns.data.scene_info import NDC
 from sparsestyle_ns.engine.training import FusedAdamConfig
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.field_components.positional_encoding import NoEncoding
@@ -37,7 +38,7 @@ def make_model(effects=SPARE, **settings):
     return model
 
 
-def make_untrained(effects=SPARE, seed=0, device="cpu", object_cells=1.0, **settings):
+def make_untrained(effects=SPARE, seed=0, device="cpu", ndc=None, object_cells=1.0, **settings):
     torch.manual_seed(seed)
     config = HierStyleModelConfig(
         coarse_field=CoarseFieldConfig(num_levels=3, num_layers=2, layer_width=16, feature_dim=4, direction_levels=2),
@@ -54,7 +55,7 @@ def make_untrained(effects=SPARE, seed=0, device="cpu", object_cells=1.0, **sett
         **settings,
     )
     decisions = decided(*effects, background={"color": [1.0, 0.5, 0.0]})
-    return config.setup(scene_box=BOX, num_train_data=1, effects=decisions, device=device).eval()
+    return config.setup(scene_box=BOX, num_train_data=1, effects=decisions, ndc=ndc, device=device).eval()
 
 
 @pytest.fixture
@@ -64,6 +65,13 @@ def model():
 
 def test_an_object_on_a_background_has_more_cells():
     assert make_untrained(object_cells=2.0).residual.grid.resolutions == (4, 16)
+
+
+def test_only_a_scene_seen_from_one_side_has_fewer_cells_along_depth():
+    ahead = NDC((1.5, 2.0), near=1.0, depth_range=(1.2, 5.0))
+    in_ndc = make_untrained(("ndc", *(each for each in SPARE if each != "box")), ndc=ahead, depth_cells=0.125)
+    assert in_ndc.residual.stretch == (1.0, 1.0, 0.125)
+    assert make_untrained(depth_cells=0.125).residual.stretch == (1.0, 1.0, 1.0)
 
 
 @torch.no_grad()
