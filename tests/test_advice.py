@@ -700,6 +700,7 @@ TABLE = [
     Advice("has no signed distances; take ns-export poisson --normal-method open3d", None, None),
     Advice("has no normals of its own; add --normal-method open3d", None, None),
     Advice("--obb-center, --obb-rotation and --obb-scale have an effect only together", None, None),
+    Advice("--obb-scale holds no surface", None, None),
     # ns-eval, in tests/test_nothing_lost.py
     Advice("ns-eval writes JSON, and --output-path is ", None, None),
     # ns-render; more in tests/pipelines/test_render_command.py
