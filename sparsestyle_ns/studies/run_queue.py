@@ -24,12 +24,14 @@ from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
 from sparsestyle_ns.studies.study import Stage, Study
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
-from sparsestyle_ns.utils.interrupts import PRESSES, end_on_ctrl_c, stop
+from sparsestyle_ns.utils.interrupts import PRESSES, end_on_ctrl_c, ending_on, stop
 from sparsestyle_ns.utils.progress import PROGRESS_FILE, ProgressReport, bar, duration, report, say
 
 SECONDS_FILE = "training_seconds.json"
 TRAINING_PROCESS = (sys.executable, "-m", "sparsestyle_ns.studies.run_queue")
 """Followed by a config's file, it trains a run in a process of its own."""
+ENDINGS = (*PRESSES, SystemExit)
+"""What a signal raises that ends this process, and has to end the runs that it waits for."""
 CORES_PER_JOB = 4
 """CPU cores that a run makes good use of."""
 SECONDS_BETWEEN_LOOKS = 2.0
@@ -139,13 +141,15 @@ class RunQueue:
         Raises:
             InputError: a run failed.
             StoppedByCtrlC: Ctrl-C was pressed; either way what is done is kept.
+            SystemExit: SIGTERM or SIGHUP, which end the runs that are under way as Ctrl-C does.
         """
         wanted = list(dict.fromkeys([*(run.coarse for run in runs if run.coarse is not None), *runs]))
         self.say(self.forecast(wanted))
         try:
-            for has_coarse in (False, True):
-                stage = [run for run in wanted if (run.coarse is not None) is has_coarse and not run.is_finished]
-                self._train_beside_each_other(stage, wanted)
+            with ending_on(signal.SIGTERM, signal.SIGHUP):
+                for has_coarse in (False, True):
+                    stage = [run for run in wanted if (run.coarse is not None) is has_coarse and not run.is_finished]
+                    self._train_beside_each_other(stage, wanted)
         except PRESSES:
             stop("Stopped by Ctrl-C; the same command goes on where it was.")
 
@@ -165,7 +169,7 @@ class RunQueue:
                 list(pool.map(train, runs))
             except BaseException as error:
                 pool.shutdown(wait=False, cancel_futures=True)
-                if isinstance(error, PRESSES):
+                if isinstance(error, ENDINGS):
                     _interrupt(self._training)
                 raise
 
@@ -237,7 +241,7 @@ def _follow(process: subprocess.Popen, progress: Path, name: str, iterations: in
         while process.poll() is None:
             try:
                 process.wait(timeout=SECONDS_BETWEEN_LOOKS)
-            except PRESSES:
+            except ENDINGS:
                 _interrupt([process])
                 raise
             except subprocess.TimeoutExpired:

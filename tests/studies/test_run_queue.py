@@ -1,7 +1,11 @@
 """Runs are found again by what they are, gone on with, and not done twice."""
 
 import json
+import os
+import signal
 import sys
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import List, Tuple
@@ -207,6 +211,30 @@ def test_after_ctrl_c_nothing_more_is_begun(
     assert ended.value.code == 130
     assert "Stopped by Ctrl-C; the same command goes on where it was." in capsys.readouterr().err
     assert begun == ["0"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_run_doesnt_outlive_the_command_that_began_it(
+    number: int, jobs: int, queue: RunQueue, coarse: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = tmp_path / "begun"
+    begun.mkdir()
+    lasting = f"import os, pathlib, time; pathlib.Path({str(begun)!r}, str(os.getpid())).touch(); time.sleep(60)"
+    monkeypatch.setattr(run_queue, "TRAINING_PROCESS", (sys.executable, "-c", lasting))
+
+    def press() -> None:
+        while len(list(begun.iterdir())) < jobs:
+            time.sleep(0.05)
+        os.kill(os.getpid(), number)
+
+    threading.Thread(target=press, daemon=True).start()
+    before = signal.getsignal(number)
+    with pytest.raises(SystemExit) as ended:
+        replace(queue, jobs=jobs).train([replace(coarse, name=str(number)) for number in range(jobs)])
+    assert ended.value.code == 128 + number
+    assert signal.getsignal(number) is before
+    assert not [path.name for path in begun.iterdir() if Path("/proc", path.name).exists()]
 
 
 def test_runs_beside_each_other_share_the_cores(queue: RunQueue, coarse: Run, monkeypatch: pytest.MonkeyPatch) -> None:
