@@ -40,6 +40,9 @@ PERCEPTUAL = ("rmse", "ssim", "lpips", "st_lpips")
 CONSISTENCY = [(f"{part}_{kind}", kind, f"{part} ") for part in ("short", "long") for kind in PERCEPTUAL]
 """Columns of short- and long-range consistency, for `table_of`."""
 
+LEAST_WIDTH = 9
+"""Characters that a column needs, so that its figures and most words of its heading are whole."""
+
 
 @dataclass
 class Table:
@@ -56,13 +59,27 @@ class Table:
     """Names of rows whose figures are others', not measured here."""
 
     def print(self) -> None:
-        """Prints it."""
-        columns = [Column(name, justify="right") for name in self.columns]
-        words = {"title": self.title, "caption": self.note or None}
-        printed = RichTable("", *columns, **words, title_justify="left", caption_justify="left")
+        """Prints it; with rows as columns where it has more columns than fit beside each other."""
+        console = Console()
+        wide = LEAST_WIDTH * (1 + len(self.columns)) > console.width
+        console.print(self._turned() if wide and len(self.rows) < len(self.columns) else self._upright())
+
+    def _upright(self) -> RichTable:
+        printed = self._with_columns(self.columns)
         for name, cells in self.rows:
             printed.add_row(name, *(cell or "–" for cell in cells), style="italic dim" if name in self.cited else None)
-        Console().print(printed)
+        return printed
+
+    def _turned(self) -> RichTable:
+        printed = self._with_columns([name for name, _ in self.rows])
+        for place, name in enumerate(self.columns):
+            printed.add_row(name, *(cells[place] or "–" for _, cells in self.rows))
+        return printed
+
+    def _with_columns(self, names: Sequence[str]) -> RichTable:
+        words = {"title": self.title, "caption": self.note or None}
+        columns = [Column(name, justify="right") for name in names]
+        return RichTable("", *columns, **words, title_justify="left", caption_justify="left")
 
 
 def table_of(

@@ -133,12 +133,12 @@ def points_table(points: Sequence[FrontPoint]) -> Table:
 
 
 def ratios_table(points: Sequence[FrontPoint]) -> Table:
-    """What ours has of ARF's kind's distances where both keep as much content; below 1 is closer to the painting."""
+    """What ours has of ARF's kind's distances where it keeps as much content, or more; below 1 is better."""
     keys = (*DISTANCES, "short_rmse", "long_rmse")
     labels = [LABELS[key][0] if key in LABELS else f"{key[:-5]} {LABELS['rmse'][0]}" for key in keys]
-    table = Table("Ours over ARF's kind at equal content kept", labels)
+    table = Table("Ours over ARF's kind at equal content kept, or where ours keeps more with every weight", labels)
     for level in KEPT_LEVELS:
-        pairs = [[at_kept(points, kind, key, level) for kind in (OURS, ARF)] for key in keys]
+        pairs = [[at_kept(points, OURS, key, level, or_more=True), at_kept(points, ARF, key, level)] for key in keys]
         cells = [None if None in pair else f"{pair[0] / pair[1]:.2f}" for pair in pairs]
         if any(cells):
             table.rows.append((f"SSIM {level:.1f}", cells))
@@ -146,10 +146,15 @@ def ratios_table(points: Sequence[FrontPoint]) -> Table:
     return table
 
 
-def at_kept(points: Sequence[FrontPoint], kind: str, key: str, kept: float) -> Optional[float]:
-    """A figure of a kind at some content kept, on lines between its points; None beyond them, or where none has it."""
+def at_kept(points: Sequence[FrontPoint], kind: str, key: str, kept: float, or_more: bool = False) -> Optional[float]:
+    """A figure of a kind at some content kept, on lines between its points; None beyond them, or where none has it.
+
+    With `or_more`, where all of its points keep more, that of the point which keeps least.
+    """
     having = [point for point in points if point.kind == kind and key in point.measured.figures]
     own = sorted((point.kept, point.measured.figures[key]) for point in having)
+    if own and or_more:
+        kept = max(kept, own[0][0])
     if not own or not own[0][0] <= kept <= own[-1][0]:
         return None
     place = max(1, bisect.bisect_left([each for each, _ in own], kept))

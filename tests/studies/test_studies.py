@@ -237,6 +237,8 @@ def test_a_front_is_read_between_its_points_and_not_beyond() -> None:
     points = points_of("ours", (0.7, 0.3), (0.3, 0.1), (0.5, 0.2)) + points_of("other", (0.4, 9.0))
     found = [front.at_kept(points, "ours", "style_loss", kept) for kept in (0.2, 0.3, 0.4, 0.6, 0.7, 0.8)]
     assert found == [None, *map(pytest.approx, (0.1, 0.15, 0.25, 0.3)), None]
+    assert front.at_kept(points, "ours", "style_loss", 0.2, or_more=True) == found[1]
+    assert front.at_kept(points, "ours", "style_loss", 0.8, or_more=True) is None
     assert front.at_kept(points, "other", "style_loss", 0.4) == 9.0
     assert front.at_kept(points, "none", "style_loss", 0.4) is None
 
