@@ -47,8 +47,8 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     view_side: Union[int, Literal["auto", "photos"]] = "auto"
     """Longer side, in pixels, of the views that are stylised, where photos are larger; as many times more as strokes
     are finer than 1. Pictures are of any size all the same. auto: 252, and for an object on a background the photos'
-    size. In larger views the style loss makes ripples as fine as bristles, finer than what few photos of a whole scene
-    agree on; an object, seen from all around, holds more."""
+    size. Larger views take longer, and the style loss asks there for marks that are finer than what few photos of a
+    whole scene agree on; an object, seen from all around, holds more."""
     view_scales: Tuple[float, ...] = (0.5, 1.0)
     """Sizes at which the views are stylised, one after another, as shares of `view_side`; the last is the one that
     counts, and iterations before it are quick."""
