@@ -1,6 +1,8 @@
 """Both methods on a second device (`second_device.py`): nothing is left on the CPU, and little is waited for."""
 
 import copy
+import functools
+import itertools
 import json
 from contextlib import nullcontext
 from pathlib import Path
@@ -23,6 +25,8 @@ from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.field_components import hash_grid
 from sparsestyle_ns.fields.coarse import CoarseFieldConfig
 from sparsestyle_ns.method_configs import method_config
+from sparsestyle_ns.rendering.look import Look
+from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.style.painting import Painting
 
 FIELD = CoarseFieldConfig(num_levels=3, num_layers=2, layer_width=16, feature_dim=4)
@@ -208,6 +212,27 @@ def test_stage_2_trains_and_renders_there(
         look(training)
     held = {name: str(value.device) for name, value in training.pipeline.state_dict().items()}
     assert set(held.values()) == {"cuda:0"}, held
+
+
+@pytest.mark.parametrize("residual_density", ["on", "off"])
+def test_what_the_viewers_controls_ask_for_is_drawn_there(
+    device: SecondDevice, llff_scene: Path, painting: Path, residual_density: str
+) -> None:
+    effects = {"residual_density": residual_density}
+    config = style_config(llff_scene, painting, effects)
+    training = Training(config, CUDA, coarse_state(llff_scene, effects))
+    training.step()
+    pipeline = training.pipeline.eval()
+    model, camera = pipeline.model, pipeline.datamanager.train_dataset.cameras[:1].to(CUDA)
+    with torch.no_grad():
+        plain = model.get_outputs_for_camera(camera)
+        for styles in ((model.residual,), (model.residual, copy.deepcopy(model.residual))):
+            for mode, mix in itertools.product(("exact", "baked"), (Mix(), Mix(0.4, 0.7, 0.3), Mix(0.0, 0.0, 1.0))):
+                shown = Look(mode, mix, styles)
+                model.display.viewer = functools.partial(copy.copy, shown)
+                drawn = model.get_outputs_for_camera(camera)
+                for name in ("rgb", "rgb_coarse"):
+                    assert drawn[name].device.type == "cuda" and drawn[name].shape == plain[name].shape
 
 
 def test_the_grids_kernels_for_cuda_train_there(llff_scene: Path, painting: Path, monkeypatch) -> None:
