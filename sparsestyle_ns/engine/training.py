@@ -14,11 +14,12 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
 from torch.amp import GradScaler
 
+from sparsestyle_ns.engine.muon import Muon
 from sparsestyle_ns.engine.schedules import over_iterations
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline, StyleTask
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.utils.errors import InputError
-from sparsestyle_ns.utils.skip_nonfinite import FiniteMuon, FiniteOptimizers
+from sparsestyle_ns.utils.skip_nonfinite import FiniteOptimizers
 
 
 @dataclass
@@ -35,7 +36,7 @@ class FusedAdamConfig(AdamOptimizerConfig):
 class MuonConfig(OptimizerConfig):
     """Muon (Jordan 2024), for the matrices of hidden layers: each step is the gradient's nearest orthogonal matrix."""
 
-    _target: Type = FiniteMuon
+    _target: Type = Muon
     lr: float = 0.02
     eps: float = 1e-7
     momentum: float = 0.95

@@ -1,6 +1,6 @@
 """Optimisers that leave everything as it is where a gradient isn't finite."""
 
-from typing import Any, Callable, Dict, Iterable, List, Optional, Tuple
+from typing import Any, Dict, Iterable, List, Tuple
 
 import torch
 from jaxtyping import Float
@@ -26,37 +26,6 @@ def step_if_finite(optimizer: Optimizer, is_broken: Float[Tensor, ""]) -> bool:
         optimizer.found_inf = is_broken
         return True
     return not is_broken.item()
-
-
-class FiniteMuon(torch.optim.Muon):
-    """torch's Muon, which leaves everything as it is where `found_inf` is 1, and for which nothing waits.
-
-    The two attributes are those by which fused optimisers are told; `grad_scale` is a scaler's.
-    """
-
-    _step_supports_amp_scaling = True
-    found_inf: Optional[Float[Tensor, ""]] = None
-    grad_scale: Optional[Float[Tensor, ""]] = None
-
-    @torch.no_grad()
-    def step(self, closure: Optional[Callable[[], float]] = None) -> Optional[float]:
-        """A step; on a GPU, what it changes is kept beside it and put back there if need be."""
-        parameters = [each for group in self.param_groups for each in group["params"] if each.grad is not None]
-        if self.grad_scale is not None:
-            for parameter in parameters:
-                parameter.grad /= self.grad_scale
-        if self.found_inf is None:
-            return super().step(closure)
-        if self.found_inf.device.type == "cpu":  # a look costs nothing there, and copies would cost time
-            return None if self.found_inf.item() else super().step(closure)
-        for parameter in parameters:
-            self.state[parameter].setdefault("momentum_buffer", torch.zeros_like(parameter.grad))
-        changed = [*parameters, *(self.state[parameter]["momentum_buffer"] for parameter in parameters)]
-        before = [tensor.clone() for tensor in changed]
-        loss = super().step(closure)
-        for tensor, value in zip(changed, before, strict=True):
-            tensor.copy_(torch.where(self.found_inf > 0, value, tensor))
-        return loss
 
 
 class FiniteOptimizers(Optimizers):
