@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import errno
 import json
 import re
 import shlex
@@ -10,17 +11,22 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Dict, List
+from typing import Dict, Iterator, List
 
 import pytest
 from conftest import TINY, TINY_STYLE, ns_train, run_entrypoint
+from interrupted import finish
+from PIL import Image
 from test_commands import press_ctrl_c_at
 from test_other_data import files_below, ns_command, refused
 
 from sparsestyle_ns.cli import main
+from sparsestyle_ns.engine.trainer import CoarseFewShotTrainer
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.runs.run_folder import hold_folder
 from sparsestyle_ns.studies.study_options import CompareOptions
 from sparsestyle_ns.studies.tradeoff_report import report_folder
+from sparsestyle_ns.utils import files
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import free_path
 
@@ -152,6 +158,115 @@ def test_two_commands_never_train_in_one_folder_at_once(llff_scene: Path, tmp_pa
         other.communicate()
     ns_train("coarse-fewshot", llff_scene, tmp_path / "outputs", *flags)
     assert steps(folder) == [0]
+
+
+def test_a_finished_run_is_free_for_others_while_its_process_goes_on(
+    llff_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As hier-style goes on after the coarse run that it has trained, and ns-train while its viewer is open."""
+    from nerfstudio.engine.trainer import Trainer
+    from nerfstudio.utils import decorators
+
+    def can_be_held(folder: Path) -> bool:
+        command = [sys.executable, "-c", HOLD, str(folder)]
+        return subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True).stdout == "held\n"
+
+    seen = []
+
+    def complete(trainer: Trainer) -> None:
+        assert can_be_held(trainer.base_dir)
+        seen.append(trainer.base_dir)
+
+    monkeypatch.setattr(Trainer, "_train_complete_viewer", complete)
+    monkeypatch.setattr(decorators, "check_viewer_enabled", lambda function: function)
+    flags = ["--timestamp", "first", "--max-num-iterations", "1", *TINY]
+    ns_train("coarse-fewshot", llff_scene, tmp_path, *flags)
+    folder = tmp_path / llff_scene.name / "coarse-fewshot" / "first"
+    assert can_be_held(folder)
+    config = SimpleNamespace(is_viewer_enabled=lambda: True, is_viewer_legacy_enabled=lambda: False)
+    hold_folder(folder)
+    trainer = SimpleNamespace(base_dir=folder, config=config, finish=lambda: None, _interrupted=False)
+    assert not can_be_held(folder)
+    trainer_class = type("T", (CoarseFewShotTrainer,), {"__init__": lambda self: vars(self).update(vars(trainer))})
+    trainer_class()._train_complete_viewer()
+    assert seen == [folder]
+
+
+@contextlib.contextmanager
+def full_disk(owner: object, name: str) -> Iterator[None]:
+    """A function that writes fails as it does on a disk that is full."""
+
+    def fail(*arguments: object, **settings: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(owner, name, fail)
+        yield
+
+
+@pytest.mark.parametrize(
+    ("command", "sentence"),
+    [
+        ("export {style} --format ply --output-path {made}/a.ply", "The points"),
+        ("export {style} --format mesh --output-path {made}/a.ply", "The mesh"),
+        ("gallery {style} --frames 0 --num-views 1 --output-path {made}/a.html", "The page"),
+        ("evaluate {coarse} --output-path {made}/a.json", "The report"),
+        ("prepare {scene} --output {made}/a", "The scene"),
+    ],
+)
+def test_what_the_disk_has_no_room_for_leaves_nothing(
+    patterned_run: Path, runs: SimpleNamespace, llff_scene: Path, tmp_path: Path, command: str, sentence: str
+) -> None:
+    if "mesh" in command:
+        pytest.importorskip("open3d", exc_type=ImportError)
+    (tmp_path / "made").mkdir()
+    places = {"style": patterned_run, "coarse": runs.coarse, "scene": llff_scene, "made": tmp_path / "made"}
+    writer = (Image.Image, "save") if "prepare" in command else (files.os, "fsync")
+    with full_disk(*writer):
+        message = refused(command.format(**places).split())
+    assert message.startswith(f"Error: {sentence} can't be written to {tmp_path / 'made' / 'a'}")
+    assert "(No space left on device); name another place with --output" in message
+    assert not list((tmp_path / "made").iterdir())
+
+
+@pytest.mark.parametrize(
+    "what", ["pointcloud --normal-method open3d --num-points 2000", "tsdf --resolution 32 --texture-method tsdf"]
+)
+def test_what_nerfstudio_has_no_room_for_leaves_nothing(patterned_run: Path, tmp_path: Path, what: str) -> None:
+    """Open3D says on a line for each number that it can't be written, and that all is well."""
+    pytest.importorskip("open3d", exc_type=ImportError)
+    (tmp_path / "made").mkdir()
+    words = ["ns-export", *what.split(), "--output-dir", tmp_path / "made" / "a"]
+    ending = finish([*words, "--load-config", patterned_run / "config.yml"], tmp_path / "log", room=20_000)
+    assert ending.status == 1 and "Traceback" not in ending.printed, ending.printed[-3000:]
+    assert not list((tmp_path / "made").iterdir())
+
+
+def test_a_run_that_the_disk_has_no_room_for_says_so_and_keeps_what_it_has(run: Path, llff_scene: Path) -> None:
+    import torch
+
+    new = ["--timestamp", "second", "--max-num-iterations", "1", *TINY]
+    with full_disk(torch, "save"), pytest.raises(SystemExit, match="nothing was saved before, so make room on the"):
+        ns_train("coarse-fewshot", llff_scene, run.parents[2], *new)
+    resume = ["--load-dir", str(run / "nerfstudio_models"), "--max-num-iterations", "5"]
+    with full_disk(torch, "save"), pytest.raises(SystemExit, match=r"iteration 3 is saved, so make room .* --load-dir"):
+        train_again(run, llff_scene, *resume)
+    assert steps(run) == [2]
+    train_again(run, llff_scene, *resume)
+    assert steps(run) == [2, 4]
+
+
+@pytest.mark.parametrize("kind", [errno.ENOSPC, errno.EACCES])
+def test_a_disk_that_fails_anywhere_in_a_command_is_said(
+    runs: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, kind: int
+) -> None:
+    def fail(*arguments: object) -> None:
+        raise OSError(kind, "so it is", "a/file")
+
+    monkeypatch.setattr("sparsestyle_ns.engine.loading.load_run", fail)
+    assert refused(["evaluate", str(runs.coarse), "--output-path", "a.json"]) == (
+        "Error: a/file can't be read or written (so it is); see to the disk and its rights, and try again."
+    )
 
 
 def test_a_report_of_something_else_is_kept_under_another_name(run: Path, capsys: pytest.CaptureFixture) -> None:

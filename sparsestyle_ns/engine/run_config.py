@@ -13,7 +13,7 @@ import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
 from sparsestyle_ns.pipelines.ns_commands import begin_command
-from sparsestyle_ns.runs.checkpoints import checkpoint_path, checkpoint_step, newest_checkpoint
+from sparsestyle_ns.runs.checkpoints import checkpoint_path, checkpoint_step, load_checkpoint, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import hold_folder, read_config
 from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
@@ -57,11 +57,12 @@ class RunConfig(TrainerConfig):
     def open_in(self, folder: Path) -> None:
         """Makes this the config of the run in a folder: of its newest checkpoint, and of the scene that it is of.
 
-        InputError where it has no checkpoint, or its scene isn't there.
+        InputError where it has no checkpoint that can be read, or its scene isn't there.
         """
         newest = newest_checkpoint(folder / self.relative_model_dir)
         if newest is None:
             raise InputError(f"{folder} has no checkpoint yet; train it, or name another run.")
+        load_checkpoint(newest, mmap=True)  # nerfstudio, which reads it, would say of a damaged one what torch does
         record, manager = SceneRecord.load(folder), self.pipeline.datamanager
         self.run_folder, self.load_step = folder, checkpoint_step(newest)
         # A command, as `ns-render dataset --data FOLDER`, may have named another place.
@@ -131,16 +132,17 @@ class RunConfig(TrainerConfig):
 
     def hold_folder(self) -> None:
         """Makes the run's folder, its own until the process ends; InputError where it can't, or another has it."""
-        with self._saving():
+        with self.saving():
             hold_folder(self.get_base_dir())
 
     def write_config(self) -> None:
         """Writes config.yml into the run's folder; InputError where it can't be written."""
-        with self._saving():
+        with self.saving():
             write_whole(self.get_base_dir() / "config.yml", yaml.dump(self))
 
     @contextmanager
-    def _saving(self) -> Iterator[None]:
+    def saving(self) -> Iterator[None]:
+        """InputError where something can't be written into the run's folder before training begins."""
         try:
             yield
         except OSError as error:

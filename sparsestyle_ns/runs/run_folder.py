@@ -44,7 +44,7 @@ _held: Dict[Path, int] = {}
 
 
 def hold_folder(folder: Path) -> None:
-    """Makes a run's folder, and keeps it for this process until that ends, however it does.
+    """Makes a run's folder, and keeps it for this process until `release_folder`, or its end, however that comes.
 
     InputError where another process keeps it; OSError where it can't be made.
     """
@@ -63,6 +63,14 @@ def hold_folder(folder: Path) -> None:
         os.close(descriptor)
         return
     _held[folder.resolve()] = descriptor
+
+
+def release_folder(folder: Path) -> None:
+    """Lets other processes write into a run's folder again, if this one has kept it."""
+    descriptor = _held.pop(folder.resolve(), None)
+    if descriptor is not None:
+        fcntl.flock(descriptor, fcntl.LOCK_UN)  # also where a process that was forked meanwhile has the file open
+        os.close(descriptor)
 
 
 def remove_empty_run(folder: Path, around: Sequence[Path]) -> None:
