@@ -18,6 +18,7 @@ import pytest
 import torch
 import tyro
 from conftest import TINY, TINY_STYLE, coarse_pipeline, run_entrypoint
+from PIL import Image
 from test_docs import ROOT, all_flags, nerfstudio_flags, subcommands
 
 from sparsestyle_ns.cli import main
@@ -199,6 +200,13 @@ def study(command: str, flags: str) -> str:
 def no_photos_in(name: str, place: SimpleNamespace) -> None:
     photos(place)
     (Path("photos") / name).mkdir()
+    typed("ns-train coarse-fewshot --data photos llff-data", place)
+
+
+def other_photos(place: SimpleNamespace) -> None:
+    for path in Path(photos(place)).glob("images*/*"):
+        Image.open(path).save(path.with_suffix(".webp"))
+        path.unlink()
     typed("ns-train coarse-fewshot --data photos llff-data", place)
 
 
@@ -407,6 +415,9 @@ TABLE = [
         "put the photos there, or choose another folder with --downscale-factor",
         lambda place: no_photos_in("images_8", place),
         "ns-train coarse-fewshot --data photos llff-data --downscale-factor 1",
+    ),
+    Advice(
+        "make a scene of it with sparsestyle prepare ", other_photos, "sparsestyle prepare photos --output photos-scene"
     ),
     Advice(" with --downscale-factor", coarse("", "--downscale-factor 2"), coarse("", "--downscale-factor 1")),
     # Views
@@ -668,6 +679,9 @@ TABLE = [
     Advice("leave --poses file out", None, None),  # tests/prepare
     Advice("pip install pillow-heif", read_heic, None),
     Advice("`pip install imageio-ffmpeg`", without_ffmpeg, None),
+    Advice("add --colmap-path …", None, None),  # tests/data/test_colmap.py
+    Advice("say where it is behind the word colmap", None, None),  # the same
+    Advice("name its run with --coarse-run", None, style("")),
     Advice("leave that out, as photos are reduced to --max-image-side", None, None),  # tests/data/test_colmap.py
     # Models
     Advice("ends rays; leave it out", coarse("--pipeline.model.enable-collider True"), coarse("")),

@@ -54,11 +54,11 @@ def train_again(run: Path, scene: Path, *flags: str) -> None:
     ns_train("coarse-fewshot", scene, run.parents[2], "--timestamp", "first", *TINY, *flags)
 
 
-def load_config(run: Path) -> None:
+def load_config(run: Path, method: str = "coarse-fewshot", *flags: str) -> None:
     """`ns-train coarse-fewshot --load-config` of a run, without a viewer."""
     from nerfstudio.scripts import train
 
-    run_entrypoint(train.entrypoint, ["coarse-fewshot", "--load-config", str(run / "config.yml")])
+    run_entrypoint(train.entrypoint, [method, "--load-config", str(run / "config.yml"), *flags])
 
 
 @pytest.mark.parametrize("iterations", ["2", "3", "5"])
@@ -87,6 +87,18 @@ def test_a_run_that_isnt_gone_on_with_stays_as_it_is(run: Path, llff_scene: Path
     with pytest.raises(SystemExit, match="Error: "):
         train_again(run, llff_scene, "--load-dir", str(run / "nerfstudio_models"), *flags)
     assert files_below(run) == before
+
+
+def test_a_run_isnt_gone_on_with_by_the_other_method(
+    run: Path, runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path
+) -> None:
+    more = ["--max-num-iterations", "9"]
+    style = ["--style-image", str(painting), "--load-dir", str(runs.coarse / "nerfstudio_models"), *TINY_STYLE]
+    with pytest.raises(SystemExit, match=r"is of coarse-fewshot; name its run with --coarse-run instead[.]$"):
+        ns_train("hier-style", llff_scene, tmp_path / "new", *style, *more)
+    coarse = ["--load-dir", str(runs.style / "nerfstudio_models"), *TINY]
+    with pytest.raises(SystemExit, match=r"is of hier-style; go on with that instead[.]$"):
+        ns_train("coarse-fewshot", llff_scene, tmp_path / "new", *coarse, *more)
 
 
 def test_a_run_isnt_gone_on_with_from_before_its_newest_checkpoint_in_its_own_folder(
@@ -121,6 +133,23 @@ def test_the_config_of_a_finished_run_begins_another_one(
     load_config(new)  # which that command does
     assert steps(new) == [1, 2]
     assert files_below(run) == before
+
+
+def test_what_is_typed_beside_a_config_is_named_and_another_method_refused(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    before = files_below(run.parents[1])
+    advice = (
+        f"of a run of coarse-fewshot, and hier-style was asked for; type ns-train coarse-fewshot --load-config {run}"
+    )
+    with pytest.raises(SystemExit, match=re.escape(advice)):
+        load_config(run, "hier-style")
+    assert files_below(run.parents[1]) == before
+    with monkeypatch.context() as patch, contextlib.suppress(SystemExit):
+        press_ctrl_c_at(patch, step=1)
+        load_config(run, "coarse-fewshot", "--max-num-iterations=1", "--previews", "1.0")
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Without effect beside --load-config, whose file says all: --max-num-iterations, --previews." in printed
 
 
 def test_runs_that_begin_in_one_second_have_folders_of_their_own(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from sparsestyle_ns.runs.run_folder import hold_folder, read_config
 from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.files import write_whole
+from sparsestyle_ns.utils.interrupts import ns_option
 from sparsestyle_ns.utils.progress import say
 
 NO_TIMESTAMP = "{timestamp}"
@@ -94,6 +95,7 @@ class RunConfig(TrainerConfig):
         Else it goes on with that run. A config that `--load-config` has read goes on with its own run where that isn't
         finished, and else begins a new one. InputError where there is a run that this one doesn't go on with.
         """
+        self._say_what_it_leaves_out()
         self._settle_paths()
         folder, newest = self.get_base_dir(), newest_checkpoint(self.get_checkpoint_dir())
         if newest is None:
@@ -114,6 +116,24 @@ class RunConfig(TrainerConfig):
                 f"--load-dir {newest.parent}."
             )
         return False
+
+    def _say_what_it_leaves_out(self) -> None:
+        """Names what was typed beside `--load-config`, whose file nerfstudio takes in place of all of it.
+
+        InputError where it is of another method than the one that was asked for.
+        """
+        path, words = ns_option("load-config"), sys.argv[1:]
+        if path is None or words[0].startswith("-"):
+            return
+        if self.pipeline.decided is not None and words[0] != self.method_name:
+            raise InputError(
+                f"--load-config {path} is of a run of {self.method_name}, and {words[0]} was asked for; "
+                f"type ns-train {self.method_name} --load-config {path}."
+            )
+        others = sorted({word.split("=")[0] for word in words if word.startswith("--")})
+        others = [word for word in others if word.replace("_", "-") != "--load-config"]
+        if others:
+            say(f"Without effect beside --load-config, whose file says all: {', '.join(others)}.")
 
     def _settle_paths(self) -> None:
         """A run may be opened from another folder, and a shell leaves ~ alone behind an equals sign."""

@@ -30,7 +30,7 @@ from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.runs import checkpoints
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path
-from sparsestyle_ns.runs.run_folder import release_folder, remove_empty_run
+from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD, release_folder, remove_empty_run
 from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord, record_scene
 from sparsestyle_ns.utils.distributed import any_process, prepare_launch, share_state
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
@@ -132,6 +132,12 @@ class SparseStyleTrainer(Trainer, ABC):
 
     def _expect_what_was(self, before: Dict[str, Any]) -> None:
         """Takes from a checkpoint what training goes on with; InputError where the command line says something else."""
+        is_style = self.config.method_name.startswith(STYLE_METHOD)
+        if is_style != any(name.startswith("_model.residual.") for name in before["pipeline"]):
+            other, advice = (
+                (COARSE_METHOD, "name its run with --coarse-run") if is_style else (STYLE_METHOD, "go on with that")
+            )
+            raise InputError(f"The checkpoint {self.config.resumed_checkpoint()} is of {other}; {advice} instead.")
         done, total = before["step"] + 1, self.config.max_num_iterations
         if done >= total:
             of = f"The checkpoint is of iteration {done}"

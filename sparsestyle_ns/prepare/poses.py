@@ -13,7 +13,7 @@ from PIL import Image
 from sparsestyle_ns.data.estimated import TRANSFORMS
 from sparsestyle_ns.data.llff import read_poses_bounds
 from sparsestyle_ns.data.photos import read_mask_of
-from sparsestyle_ns.data.reading import check_lenses, read_transforms
+from sparsestyle_ns.data.reading import SPLITS, check_lenses, check_splits, read_transforms
 from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, Photo, Size, mask_name, read_photo
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.pictures import as_upright
@@ -21,8 +21,6 @@ from sparsestyle_ns.utils.pictures import as_upright
 POSES_BOUNDS = "poses_bounds.npy"
 ASPECT_TOLERANCE = 0.02
 """Share by which the aspect of a photo may differ from that of its pose: sizes are whole pixels."""
-SPLITS = ("train_filenames", "val_filenames", "test_filenames")
-"""Entries of a `transforms.json` that list photos by their file_path; nerfstudio wants all three where it has one."""
 MASK, DEPTH = "mask_path", "depth_file_path"
 """Entries of a frame that are pictures of the photo's old size: masks come along, depth maps don't."""
 SHARED = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "ply_file_path")
@@ -84,13 +82,7 @@ class TransformsPoses:
         self.path = path
         self.content: Dict[str, Any] = read_transforms(path, with_angle=False)
         check_lenses(path, self.content)
-        for split in SPLITS:
-            names = self.content.get(split, [])
-            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-                raise InputError(
-                    f"{path} has {split} that is no list of names: list the file_path of each photo there, or take "
-                    f"{', '.join(SPLITS)} out."
-                )
+        check_splits(path, self.content)
         for index, frame in enumerate(self.content["frames"]):
             if not isinstance(frame.get(MASK, ""), str):
                 raise InputError(
