@@ -709,8 +709,16 @@ TABLE = [
     ),  # tests/export/test_web_page.py
     Advice("stylise one coarse run twice (--coarse-run)", None, None),  # tests/export/test_web_page.py
     Advice("; export the run with --format splat.", None, None),  # tests/viewer/test_splat_controls.py
+    # --load-config, in tests/test_nothing_lost.py
+    Advice("; type ns-train … --load-config ….", None, None),
+    Advice("Without effect beside --load-config, whose file says all", None, None),
     # ns-export, in tests/export/test_ns_export.py
     Advice("has no Gaussians yet; have them made by sparsestyle export RUN --format splat", None, None),
+    Advice("There is no surface in the box from --bounding-box-min", None, None),
+    Advice("ns-export poisson takes points from everywhere, or from the box of", None, None),
+    Advice("--resolution is …; give one number of cells, or three", None, None),
+    Advice("--bounding-box-min isn't below --bounding-box-max", None, None),
+    Advice("--downscale-factor is …, and the views have … pixels; give less", None, None),
     Advice("has no signed distances; take ns-export poisson --normal-method open3d", None, None),
     Advice("has no normals of its own; add --normal-method open3d", None, None),
     Advice("--obb-center, --obb-rotation and --obb-scale have an effect only together", None, None),

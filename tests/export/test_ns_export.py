@@ -141,6 +141,11 @@ BOX = "--obb-rotation 0 0 0 --obb-scale 1 1 1"
         ("tsdf --resolution 100000 --output-dir {tmp}/new", 1, set()),  # more memory than any machine has
         ("tsdf --rgb-output-name depth --output-dir {tmp}/new", 1, set()),
         ("cameras --output-dir {tmp}/taken/new", 1, set()),
+        (
+            "tsdf --downscale-factor 1 --resolution 16 --texture-method tsdf --output-dir {tmp}/new",
+            0,
+            {"new", "tsdf_mesh.ply"},
+        ),
         ("cameras --output-dir {tmp}/new", 0, {"new", "transforms_train.json", "transforms_eval.json"}),
     ],
 )
