@@ -22,7 +22,7 @@ BOX = ("obb_center", "obb_rotation", "obb_scale")
 """Options that place a box of points, all or none of them."""
 LEAST: Mapping[str, float] = {
     **dict.fromkeys(("num_rays_per_batch", "downscale_factor", "batch_size", "px_per_uv_triangle"), 1),
-    **{"num_points": LEAST_POINTS, "num_pixels_per_side": 8, "target_num_faces": 4},
+    **{"num_points": 1, "num_pixels_per_side": 8, "target_num_faces": 4},
     **{"std_ratio": 0.001, "refinement_epsilon": 0.0},
 }
 """Numbers that nerfstudio, or the libraries that it hands them to, need at least."""
@@ -44,6 +44,9 @@ def check_export(command: Any) -> None:
         value = getattr(command, option, None)
         if value is not None and not least <= value < math.inf:
             raise InputError(f"{flag(option)} is {value}; give {least} or more.")
+    counts = [getattr(command, option, math.inf) for option in ("num_points", "num_rays_per_batch")]
+    if max(counts) < LEAST_POINTS:  # whole batches are taken
+        raise InputError(f"--num-points is {counts[0]}; give {LEAST_POINTS} or more.")
     _check_grid(command)
     for line in unused(command, NOT_OF_POISSON) if type(command).__name__ == "ExportPoissonMesh" else ():
         say(line)

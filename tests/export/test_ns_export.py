@@ -75,6 +75,11 @@ def test_an_export_never_takes_the_place_of_a_file(kind, settings, name, tmp_pat
         ("ExportMarchingCubesMesh", {}, "ns-export poisson --normal-method open3d"),
         ("ExportPointCloud", {}, "no normals of its own; add --normal-method open3d"),
         ("ExportPoissonMesh", {"normal_method": "open3d", "num_points": 0}, "--num-points is 0; give 1 or more"),
+        (
+            "ExportPointCloud",
+            {"normal_method": "open3d", "num_points": 9, "num_rays_per_batch": 9},
+            "--num-points is 9; give 100 or more",
+        ),
         ("ExportTSDFMesh", {"downscale_factor": 0}, "--downscale-factor is 0; give 1 or more"),
         (
             "ExportTSDFMesh",
