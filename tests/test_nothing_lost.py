@@ -23,7 +23,7 @@ from test_other_data import files_below, ns_command, refused
 from sparsestyle_ns.cli import main
 from sparsestyle_ns.engine.trainer import CoarseFewShotTrainer
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
-from sparsestyle_ns.runs.run_folder import hold_folder
+from sparsestyle_ns.runs.run_folder import hold_folder, read_config
 from sparsestyle_ns.studies.study_options import CompareOptions
 from sparsestyle_ns.studies.tradeoff_report import report_folder
 from sparsestyle_ns.utils import files
@@ -167,7 +167,7 @@ def test_runs_that_begin_in_one_second_have_folders_of_their_own(tmp_path: Path)
 
 HOLD = """
 import sys, pathlib
-from sparsestyle_ns.runs.run_folder import hold_folder
+from sparsestyle_ns.runs.run_folder import hold_folder, read_config
 hold_folder(pathlib.Path(sys.argv[1]))
 print("held", flush=True)
 sys.stdin.read()
@@ -219,6 +219,20 @@ def test_a_finished_run_is_free_for_others_while_its_process_goes_on(
     trainer_class = type("T", (CoarseFewShotTrainer,), {"__init__": lambda self: vars(self).update(vars(trainer))})
     trainer_class()._train_complete_viewer()
     assert seen == [folder]
+
+
+def test_a_run_is_read_while_another_process_trains_in_its_folder_and_drops_checkpoints(run: Path) -> None:
+    config, (checkpoint,) = read_config(run), (run / "nerfstudio_models").glob("*")
+    content = checkpoint.read_bytes()
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(run)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout.readline() == "held\n"
+        config.open_in(run)
+        other.communicate()
+    checkpoint.unlink()
+    assert (config.get_checkpoint_dir() / checkpoint.name).read_bytes() == content
+    assert config.get_base_dir() == run
 
 
 @contextlib.contextmanager

@@ -1,9 +1,11 @@
 """Where a run is: a new one never takes another's folder, and one that is opened is found where it lies now."""
 
 import os
+import shutil
 import sys
+import tempfile
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Dict, Iterator, Optional
@@ -14,11 +16,11 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from sparsestyle_ns.pipelines.ns_commands import begin_command
 from sparsestyle_ns.runs.checkpoints import checkpoint_path, checkpoint_step, load_checkpoint, newest_checkpoint
-from sparsestyle_ns.runs.run_folder import hold_folder, read_config
+from sparsestyle_ns.runs.run_folder import hold_folder, is_held, read_config
 from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.files import write_whole
-from sparsestyle_ns.utils.interrupts import ns_option
+from sparsestyle_ns.utils.interrupts import ns_option, take_away_at_end
 from sparsestyle_ns.utils.progress import say
 
 NO_TIMESTAMP = "{timestamp}"
@@ -60,6 +62,8 @@ class RunConfig(TrainerConfig):
 
         InputError where it has no checkpoint that can be read, or its scene isn't there.
         """
+        if is_held(folder):
+            self.relative_model_dir = _kept_copy(folder / self.relative_model_dir)
         newest = newest_checkpoint(folder / self.relative_model_dir)
         if newest is None:
             raise InputError(f"{folder} has no checkpoint yet; train it, or name another run.")
@@ -191,6 +195,20 @@ class RunConfig(TrainerConfig):
                 f"{checkpoint_step(newest)}, the newest."
             )
         return checkpoint
+
+
+def _kept_copy(checkpoints: Path) -> Path:
+    """A folder with a copy of the newest checkpoint, for as long as the process runs.
+
+    A training that is under way drops a checkpoint when it has saved the next one, perhaps before this one is read.
+    """
+    copies = Path(tempfile.mkdtemp(prefix="checkpoint-"))
+    take_away_at_end(lambda: shutil.rmtree(copies, ignore_errors=True))
+    while (newest := newest_checkpoint(checkpoints)) is not None:
+        with suppress(FileNotFoundError):
+            shutil.copy(newest, copies)
+            return copies
+    return checkpoints
 
 
 def _config_being_opened() -> Optional[Path]:

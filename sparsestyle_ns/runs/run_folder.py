@@ -73,6 +73,22 @@ def release_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
+def is_held(folder: Path) -> bool:
+    """Whether another process keeps a run's folder; False where that can't be told."""
+    if folder.resolve() in _held:
+        return False
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        pass
+    finally:
+        os.close(descriptor)
+    return False
+
+
 def remove_empty_run(folder: Path, around: Sequence[Path]) -> None:
     """Removes a run's folder that has neither a checkpoint nor a picture, and folders around it that held it alone.
 
