@@ -715,6 +715,7 @@ TABLE = [
     # ns-export, in tests/export/test_ns_export.py
     Advice("has no Gaussians yet; have them made by sparsestyle export RUN --format splat", None, None),
     Advice("There is no surface in the box from --bounding-box-min", None, None),
+    Advice("--num-points is …; give … or more", None, None),
     Advice("ns-export poisson takes points from everywhere, or from the box of", None, None),
     Advice("--resolution is …; give one number of cells, or three", None, None),
     Advice("--bounding-box-min isn't below --bounding-box-max", None, None),
