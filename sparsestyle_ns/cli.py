@@ -3,6 +3,7 @@
 A subcommand is a class of options, whose docstrings are its help, and a function, imported when it runs: help is fast.
 """
 
+import errno
 import importlib
 import sys
 from dataclasses import fields
@@ -16,7 +17,7 @@ from sparsestyle_ns.gallery.gallery_options import GalleryOptions
 from sparsestyle_ns.prepare.prepare_options import EffectsOptions, PrepareOptions
 from sparsestyle_ns.studies.study_options import AblateOptions, CompareOptions, TradeoffOptions
 from sparsestyle_ns.stylise.stylise_options import StyliseOptions
-from sparsestyle_ns.utils.errors import CommandOptions, exit_on_input_error
+from sparsestyle_ns.utils.errors import CommandOptions, InputError, exit_on_input_error
 from sparsestyle_ns.utils.interrupts import end_on_ctrl_c, ended_by_ctrl_c
 
 SUBCOMMANDS: Dict[str, Tuple[Type[CommandOptions], str]] = {
@@ -31,6 +32,9 @@ SUBCOMMANDS: Dict[str, Tuple[Type[CommandOptions], str]] = {
     "tradeoff": (TradeoffOptions, "studies.tradeoff:tradeoff"),
 }
 """Each subcommand's options, and the function that takes them."""
+
+DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.EFBIG, errno.ENAMETOOLONG)
+"""Errors that a disk, or one's rights on it, may lead to wherever a command reads or writes."""
 
 
 def with_dashes(arguments: List[str]) -> List[str]:
@@ -67,5 +71,13 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
         )
         options.expand_paths()
         options.check()
-        module, function = dict(SUBCOMMANDS.values())[type(options)].split(":")
-        getattr(importlib.import_module(f"sparsestyle_ns.{module}"), function)(options)
+        module, name = dict(SUBCOMMANDS.values())[type(options)].split(":")
+        try:
+            getattr(importlib.import_module(f"sparsestyle_ns.{module}"), name)(options)
+        except OSError as error:
+            if error.errno not in DISK:
+                raise
+            where = "A file" if error.filename is None else error.filename
+            raise InputError(
+                f"{where} can't be read or written ({error.strerror}); see to the disk and its rights, and try again."
+            ) from error

@@ -7,6 +7,7 @@ signal comes.
 import atexit
 import importlib
 import os
+import resource
 import signal
 import sys
 import time
@@ -72,11 +73,11 @@ def interrupt(command: List[str], moment: str, folder: Path, presses: int = 1, c
     return Ending(process.exitcode, log.read_text())
 
 
-def finish(command: List[str], folder: Path) -> Ending:
-    """Runs a command to its own end."""
+def finish(command: List[str], folder: Path, room: Optional[int] = None) -> Ending:
+    """Runs a command to its own end; with `room`, where no file can be of more bytes, as on a disk that is full."""
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "log.txt"
-    process = trial.start(_run, log, [*map(str, command)], None, None, 0)
+    process = trial.start(_run, log, [*map(str, command)], None, None, 0, room)
     try:
         process.join(SECONDS)
         assert process.exitcode is not None, log.read_text()[-3000:]
@@ -92,12 +93,16 @@ def _wait(condition: Any) -> None:
         time.sleep(0.02)
 
 
-def _run(command: List[str], moment: Optional[str], here: Optional[Path], call: int) -> None:
+def _run(
+    command: List[str], moment: Optional[str], here: Optional[Path], call: int, room: Optional[int] = None
+) -> None:
     """What the process does: the command, as its console script would."""
     from sparsestyle_ns.utils.interrupts import guard_nerfstudio
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # the server ignores it
     sys.argv = command
+    if room is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
     module, name = ENTRYPOINTS[command[0]].split(":")
     try:
         guard_nerfstudio(("coarse-fewshot", "hier-style"))  # as when the package is loaded

@@ -18,6 +18,7 @@ import pytest
 import torch
 import tyro
 from conftest import TINY, TINY_STYLE, coarse_pipeline, run_entrypoint
+from PIL import Image
 from test_docs import ROOT, all_flags, nerfstudio_flags, subcommands
 
 from sparsestyle_ns.cli import main
@@ -199,6 +200,13 @@ def study(command: str, flags: str) -> str:
 def no_photos_in(name: str, place: SimpleNamespace) -> None:
     photos(place)
     (Path("photos") / name).mkdir()
+    typed("ns-train coarse-fewshot --data photos llff-data", place)
+
+
+def other_photos(place: SimpleNamespace) -> None:
+    for path in Path(photos(place)).glob("images*/*"):
+        Image.open(path).save(path.with_suffix(".webp"))
+        path.unlink()
     typed("ns-train coarse-fewshot --data photos llff-data", place)
 
 
@@ -407,6 +415,9 @@ TABLE = [
         "put the photos there, or choose another folder with --downscale-factor",
         lambda place: no_photos_in("images_8", place),
         "ns-train coarse-fewshot --data photos llff-data --downscale-factor 1",
+    ),
+    Advice(
+        "make a scene of it with sparsestyle prepare ", other_photos, "sparsestyle prepare photos --output photos-scene"
     ),
     Advice(" with --downscale-factor", coarse("", "--downscale-factor 2"), coarse("", "--downscale-factor 1")),
     # Views
@@ -668,6 +679,9 @@ TABLE = [
     Advice("leave --poses file out", None, None),  # tests/prepare
     Advice("pip install pillow-heif", read_heic, None),
     Advice("`pip install imageio-ffmpeg`", without_ffmpeg, None),
+    Advice("add --colmap-path …", None, None),  # tests/data/test_colmap.py
+    Advice("say where it is behind the word colmap", None, None),  # the same
+    Advice("name its run with --coarse-run", None, style("")),
     Advice("leave that out, as photos are reduced to --max-image-side", None, None),  # tests/data/test_colmap.py
     # Models
     Advice("ends rays; leave it out", coarse("--pipeline.model.enable-collider True"), coarse("")),
@@ -695,8 +709,17 @@ TABLE = [
     ),  # tests/export/test_web_page.py
     Advice("stylise one coarse run twice (--coarse-run)", None, None),  # tests/export/test_web_page.py
     Advice("; export the run with --format splat.", None, None),  # tests/viewer/test_splat_controls.py
+    # --load-config, in tests/test_nothing_lost.py
+    Advice("; type ns-train … --load-config ….", None, None),
+    Advice("Without effect beside --load-config, whose file says all", None, None),
     # ns-export, in tests/export/test_ns_export.py
     Advice("has no Gaussians yet; have them made by sparsestyle export RUN --format splat", None, None),
+    Advice("There is no surface in the box from --bounding-box-min", None, None),
+    Advice("--num-points is …; give … or more", None, None),
+    Advice("ns-export poisson takes points from everywhere, or from the box of", None, None),
+    Advice("--resolution is …; give one number of cells, or three", None, None),
+    Advice("--bounding-box-min isn't below --bounding-box-max", None, None),
+    Advice("--downscale-factor is …, and the views have … pixels; give less", None, None),
     Advice("has no signed distances; take ns-export poisson --normal-method open3d", None, None),
     Advice("has no normals of its own; add --normal-method open3d", None, None),
     Advice("--obb-center, --obb-rotation and --obb-scale have an effect only together", None, None),

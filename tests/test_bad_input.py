@@ -10,7 +10,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import List
+from typing import Any, Callable, Dict, List
 
 import numpy as np
 import pytest
@@ -223,6 +223,53 @@ def test_a_scene_may_be_named_by_its_file(tmp_path: Path, capsys: pytest.Capture
     write_transforms(tmp_path, write_ring(tmp_path))
     main(["effects", "--data", str(tmp_path / "transforms.json")])
     assert f"--data {tmp_path / 'transforms.json'} nerfstudio-data" in capsys.readouterr().out.splitlines()[-1]
+
+
+def named_twice(content: Dict[str, Any]) -> None:
+    content["frames"][4]["file_path"] = content["frames"][1]["file_path"]
+
+
+def at_one_place(content: Dict[str, Any]) -> None:
+    for frame in content["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (named_twice, r"Frames 1 and 4 \(from 0\) of .* are both of images/1\.png: drop one of them"),
+        (at_one_place, "All cameras of .* stand at one place: give it photos from other places"),
+        (lambda content: content.update(camera_model="FOO"), 'has the camera_model "FOO": name one of .*OPENCV'),
+        (
+            lambda content: content.update(train_filenames="images/0.png"),
+            "has train_filenames that is no list of names",
+        ),
+        (
+            lambda content: content.update(train_filenames=[], val_filenames=[], test_filenames=["images/0.png"]),
+            "lists no photo in train_filenames: list some there, or take train_filenames, .* out",
+        ),
+    ],
+)
+def test_what_a_capture_cant_mean_is_named(tmp_path: Path, spoil: Callable[[Dict[str, Any]], None], words: str) -> None:
+    write_transforms(tmp_path, write_ring(tmp_path))
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    spoil(content)
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(SystemExit, match=words):
+        ns_train("coarse-fewshot", tmp_path, tmp_path / "outputs", *TINY, parser="nerfstudio-data")
+
+
+def test_photos_that_are_held_out_and_trained_on_are_named(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write_transforms(tmp_path, write_ring(tmp_path))
+    names = [f"images/{index}.png" for index in range(6)]
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    content.update(train_filenames=names[:4], val_filenames=names[3:], test_filenames=names[3:])
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    flags = ["--view-ids", "0", "1", "3", "--max-num-iterations", "1", *TINY]
+    ns_train("coarse-fewshot", tmp_path, tmp_path / "outputs", *flags, parser="nerfstudio-data")
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Held out, but trained on as well, so that figures say less: 3.png." in printed
 
 
 def test_a_mask_that_isnt_there_is_named(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import errno
 import json
 import re
 import shlex
@@ -10,17 +11,22 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Dict, List
+from typing import Dict, Iterator, List
 
 import pytest
 from conftest import TINY, TINY_STYLE, ns_train, run_entrypoint
+from interrupted import finish
+from PIL import Image
 from test_commands import press_ctrl_c_at
 from test_other_data import files_below, ns_command, refused
 
 from sparsestyle_ns.cli import main
+from sparsestyle_ns.engine.trainer import CoarseFewShotTrainer
 from sparsestyle_ns.runs.checkpoints import checkpoint_step, newest_checkpoint
+from sparsestyle_ns.runs.run_folder import hold_folder, read_config
 from sparsestyle_ns.studies.study_options import CompareOptions
 from sparsestyle_ns.studies.tradeoff_report import report_folder
+from sparsestyle_ns.utils import files
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import free_path
 
@@ -48,11 +54,11 @@ def train_again(run: Path, scene: Path, *flags: str) -> None:
     ns_train("coarse-fewshot", scene, run.parents[2], "--timestamp", "first", *TINY, *flags)
 
 
-def load_config(run: Path) -> None:
+def load_config(run: Path, method: str = "coarse-fewshot", *flags: str) -> None:
     """`ns-train coarse-fewshot --load-config` of a run, without a viewer."""
     from nerfstudio.scripts import train
 
-    run_entrypoint(train.entrypoint, ["coarse-fewshot", "--load-config", str(run / "config.yml")])
+    run_entrypoint(train.entrypoint, [method, "--load-config", str(run / "config.yml"), *flags])
 
 
 @pytest.mark.parametrize("iterations", ["2", "3", "5"])
@@ -81,6 +87,18 @@ def test_a_run_that_isnt_gone_on_with_stays_as_it_is(run: Path, llff_scene: Path
     with pytest.raises(SystemExit, match="Error: "):
         train_again(run, llff_scene, "--load-dir", str(run / "nerfstudio_models"), *flags)
     assert files_below(run) == before
+
+
+def test_a_run_isnt_gone_on_with_by_the_other_method(
+    run: Path, runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path
+) -> None:
+    more = ["--max-num-iterations", "9"]
+    style = ["--style-image", str(painting), "--load-dir", str(runs.coarse / "nerfstudio_models"), *TINY_STYLE]
+    with pytest.raises(SystemExit, match=r"is of coarse-fewshot; name its run with --coarse-run instead[.]$"):
+        ns_train("hier-style", llff_scene, tmp_path / "new", *style, *more)
+    coarse = ["--load-dir", str(runs.style / "nerfstudio_models"), *TINY]
+    with pytest.raises(SystemExit, match=r"is of hier-style; go on with that instead[.]$"):
+        ns_train("coarse-fewshot", llff_scene, tmp_path / "new", *coarse, *more)
 
 
 def test_a_run_isnt_gone_on_with_from_before_its_newest_checkpoint_in_its_own_folder(
@@ -117,6 +135,23 @@ def test_the_config_of_a_finished_run_begins_another_one(
     assert files_below(run) == before
 
 
+def test_what_is_typed_beside_a_config_is_named_and_another_method_refused(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    before = files_below(run.parents[1])
+    advice = (
+        f"of a run of coarse-fewshot, and hier-style was asked for; type ns-train coarse-fewshot --load-config {run}"
+    )
+    with pytest.raises(SystemExit, match=re.escape(advice)):
+        load_config(run, "hier-style")
+    assert files_below(run.parents[1]) == before
+    with monkeypatch.context() as patch, contextlib.suppress(SystemExit):
+        press_ctrl_c_at(patch, step=1)
+        load_config(run, "coarse-fewshot", "--max-num-iterations=1", "--previews", "1.0")
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Without effect beside --load-config, whose file says all: --max-num-iterations, --previews." in printed
+
+
 def test_runs_that_begin_in_one_second_have_folders_of_their_own(tmp_path: Path) -> None:
     from sparsestyle_ns.method_configs import method_config
 
@@ -132,7 +167,7 @@ def test_runs_that_begin_in_one_second_have_folders_of_their_own(tmp_path: Path)
 
 HOLD = """
 import sys, pathlib
-from sparsestyle_ns.runs.run_folder import hold_folder
+from sparsestyle_ns.runs.run_folder import hold_folder, read_config
 hold_folder(pathlib.Path(sys.argv[1]))
 print("held", flush=True)
 sys.stdin.read()
@@ -152,6 +187,129 @@ def test_two_commands_never_train_in_one_folder_at_once(llff_scene: Path, tmp_pa
         other.communicate()
     ns_train("coarse-fewshot", llff_scene, tmp_path / "outputs", *flags)
     assert steps(folder) == [0]
+
+
+def test_a_finished_run_is_free_for_others_while_its_process_goes_on(
+    llff_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As hier-style goes on after the coarse run that it has trained, and ns-train while its viewer is open."""
+    from nerfstudio.engine.trainer import Trainer
+    from nerfstudio.utils import decorators
+
+    def can_be_held(folder: Path) -> bool:
+        command = [sys.executable, "-c", HOLD, str(folder)]
+        return subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True).stdout == "held\n"
+
+    seen = []
+
+    def complete(trainer: Trainer) -> None:
+        assert can_be_held(trainer.base_dir)
+        seen.append(trainer.base_dir)
+
+    monkeypatch.setattr(Trainer, "_train_complete_viewer", complete)
+    monkeypatch.setattr(decorators, "check_viewer_enabled", lambda function: function)
+    flags = ["--timestamp", "first", "--max-num-iterations", "1", *TINY]
+    ns_train("coarse-fewshot", llff_scene, tmp_path, *flags)
+    folder = tmp_path / llff_scene.name / "coarse-fewshot" / "first"
+    assert can_be_held(folder)
+    config = SimpleNamespace(is_viewer_enabled=lambda: True, is_viewer_legacy_enabled=lambda: False)
+    hold_folder(folder)
+    trainer = SimpleNamespace(base_dir=folder, config=config, finish=lambda: None, _interrupted=False)
+    assert not can_be_held(folder)
+    trainer_class = type("T", (CoarseFewShotTrainer,), {"__init__": lambda self: vars(self).update(vars(trainer))})
+    trainer_class()._train_complete_viewer()
+    assert seen == [folder]
+
+
+def test_a_run_is_read_while_another_process_trains_in_its_folder_and_drops_checkpoints(run: Path) -> None:
+    config, (checkpoint,) = read_config(run), (run / "nerfstudio_models").glob("*")
+    content = checkpoint.read_bytes()
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(run)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout.readline() == "held\n"
+        config.open_in(run)
+        other.communicate()
+    checkpoint.unlink()
+    assert (config.get_checkpoint_dir() / checkpoint.name).read_bytes() == content
+    assert config.get_base_dir() == run
+
+
+@contextlib.contextmanager
+def full_disk(owner: object, name: str) -> Iterator[None]:
+    """A function that writes fails as it does on a disk that is full."""
+
+    def fail(*arguments: object, **settings: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(owner, name, fail)
+        yield
+
+
+@pytest.mark.parametrize(
+    ("command", "sentence"),
+    [
+        ("export {style} --format ply --output-path {made}/a.ply", "The points"),
+        ("export {style} --format mesh --output-path {made}/a.ply", "The mesh"),
+        ("gallery {style} --frames 0 --num-views 1 --output-path {made}/a.html", "The page"),
+        ("evaluate {coarse} --output-path {made}/a.json", "The report"),
+        ("prepare {scene} --output {made}/a", "The scene"),
+    ],
+)
+def test_what_the_disk_has_no_room_for_leaves_nothing(
+    patterned_run: Path, runs: SimpleNamespace, llff_scene: Path, tmp_path: Path, command: str, sentence: str
+) -> None:
+    if "mesh" in command:
+        pytest.importorskip("open3d", exc_type=ImportError)
+    (tmp_path / "made").mkdir()
+    places = {"style": patterned_run, "coarse": runs.coarse, "scene": llff_scene, "made": tmp_path / "made"}
+    writer = (Image.Image, "save") if "prepare" in command else (files.os, "fsync")
+    with full_disk(*writer):
+        message = refused(command.format(**places).split())
+    assert message.startswith(f"Error: {sentence} can't be written to {tmp_path / 'made' / 'a'}")
+    assert "(No space left on device); name another place with --output" in message
+    assert not list((tmp_path / "made").iterdir())
+
+
+@pytest.mark.parametrize(
+    "what", ["pointcloud --normal-method open3d --num-points 2000", "tsdf --resolution 32 --texture-method tsdf"]
+)
+def test_what_nerfstudio_has_no_room_for_leaves_nothing(patterned_run: Path, tmp_path: Path, what: str) -> None:
+    """Open3D says on a line for each number that it can't be written, and that all is well."""
+    pytest.importorskip("open3d", exc_type=ImportError)
+    (tmp_path / "made").mkdir()
+    words = ["ns-export", *what.split(), "--output-dir", tmp_path / "made" / "a"]
+    ending = finish([*words, "--load-config", patterned_run / "config.yml"], tmp_path / "log", room=20_000)
+    assert ending.status == 1 and "Traceback" not in ending.printed, ending.printed[-3000:]
+    assert not list((tmp_path / "made").iterdir())
+
+
+def test_a_run_that_the_disk_has_no_room_for_says_so_and_keeps_what_it_has(run: Path, llff_scene: Path) -> None:
+    import torch
+
+    new = ["--timestamp", "second", "--max-num-iterations", "1", *TINY]
+    with full_disk(torch, "save"), pytest.raises(SystemExit, match="nothing was saved before, so make room on the"):
+        ns_train("coarse-fewshot", llff_scene, run.parents[2], *new)
+    resume = ["--load-dir", str(run / "nerfstudio_models"), "--max-num-iterations", "5"]
+    with full_disk(torch, "save"), pytest.raises(SystemExit, match=r"iteration 3 is saved, so make room .* --load-dir"):
+        train_again(run, llff_scene, *resume)
+    assert steps(run) == [2]
+    train_again(run, llff_scene, *resume)
+    assert steps(run) == [2, 4]
+
+
+@pytest.mark.parametrize("kind", [errno.ENOSPC, errno.EACCES])
+def test_a_disk_that_fails_anywhere_in_a_command_is_said(
+    runs: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, kind: int
+) -> None:
+    def fail(*arguments: object) -> None:
+        raise OSError(kind, "so it is", "a/file")
+
+    monkeypatch.setattr("sparsestyle_ns.engine.loading.load_run", fail)
+    assert refused(["evaluate", str(runs.coarse), "--output-path", "a.json"]) == (
+        "Error: a/file can't be read or written (so it is); see to the disk and its rights, and try again."
+    )
 
 
 def test_a_report_of_something_else_is_kept_under_another_name(run: Path, capsys: pytest.CaptureFixture) -> None:

@@ -17,6 +17,8 @@ from sparsestyle_ns.utils.errors import InputError
 
 SPACE = "\ue000"
 """Stands for a space in a name while nerfstudio reads it; no name has this character, which is nobody's."""
+PLACES = ("sparse/0", "colmap/sparse/0", "sparse", "colmap/sparse", "0", "colmap", ".")
+"""Where a scene's folder may have a model."""
 NAME = 9
 """The place of the name in a line of images.txt."""
 
@@ -26,7 +28,8 @@ def read_colmap(parser: ColmapDataParser, split: str) -> DataparserOutputs:
     config = parser.config
     if config.downscale_factor is not None:
         _check_reduced(config)
-    with _without_spaces(config.data / config.colmap_path) as model:
+    _check_model(config)
+    with _without_spaces((config.data / config.colmap_path).absolute()) as model:  # nerfstudio puts `data` before it
         parser.config = replace(config, downscale_factor=config.downscale_factor or 1, colmap_path=model)
         try:
             outputs = parser.get_dataparser_outputs(split)
@@ -36,6 +39,19 @@ def read_colmap(parser: ColmapDataParser, split: str) -> DataparserOutputs:
         outputs,
         image_filenames=_with_spaces(outputs.image_filenames),
         mask_filenames=outputs.mask_filenames and _with_spaces(outputs.mask_filenames),
+    )
+
+
+def _check_model(config: ColmapDataParserConfig) -> None:
+    if (config.data / config.colmap_path).is_dir():
+        return
+    places = (place for place in PLACES if any((config.data / place).glob("cameras.*")))
+    place = next(places, None)
+    raise InputError(
+        f"There is no COLMAP model at {config.data / config.colmap_path}",
+        "say where it is behind the word colmap, as by --colmap-path sparse/0"
+        if place is None
+        else f"there is one at {place}: add --colmap-path {place} behind the word colmap",
     )
 
 

@@ -205,6 +205,10 @@ def _check_cameras(cameras: LLFFCameras, path: Path) -> None:
             )
 
 
+OTHER_SUFFIXES = (".webp", ".tif", ".tiff", ".heic", ".heif")
+"""Of photos that `sparsestyle prepare` takes, too."""
+
+
 def _find_images(folder: Path, downscale_factor: Optional[int], num_poses: int) -> List[Path]:
     """Sorted image files of the folder that `downscale_factor` names, one for each pose."""
     names = ["images_8", "images_4", "images"]
@@ -216,6 +220,12 @@ def _find_images(folder: Path, downscale_factor: Optional[int], num_poses: int) 
         advice = f"choose from {', '.join(there)} with --downscale-factor" if there else "put the photos into images"
         raise InputError(f"{folder} has no folder {' or '.join(names)}", advice)
     filenames = images_in(image_folder, (".jpg", ".jpeg", ".png"))
+    others = images_in(image_folder, OTHER_SUFFIXES)
+    if not filenames and others:
+        raise InputError(
+            f"{image_folder} has {others[0].name}, and only .jpg, .jpeg and .png are read",
+            f"make a scene of it with sparsestyle prepare {folder} --output {folder.name}-scene",
+        )
     if not filenames:
         raise InputError(
             f"{image_folder} has no .jpg, .jpeg or .png image",

@@ -150,6 +150,24 @@ def _check_content(path: Path, pixels: UInt8[np.ndarray, "H W channels"]) -> Non
         raise InputError(f"{path} is {kind} all over: replace it, or take it and its pose out of the scene.")
 
 
+def read_mask_of(photo: Path, mask: Path, *sizes: Tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """Which pixels of a photo a mask leaves in, as it is stored; `InputError` where it has none of these sizes."""
+    try:
+        inside = read_mask(mask.read_bytes())
+    except Exception as error:  # decoders meet a damaged file with errors of many kinds
+        fault = "can't be read" if mask.exists() else "isn't there"
+        raise InputError(f"The mask {mask} doesn't fit {photo}, as it {fault}: replace it.") from error
+    height, width = inside.shape
+    if (width, height) not in sizes:
+        raise InputError(
+            f"The mask {mask} doesn't fit {photo}: it is {width}x{height} pixels, and the photo "
+            f"{sizes[0][0]}x{sizes[0][1]}; scale it to that size."
+        )
+    if not inside.any():
+        raise InputError(f"The mask {mask} leaves nothing of {photo} in: replace it, or take out both.")
+    return inside
+
+
 class PhotoDataset(InputDataset):
     """nerfstudio's dataset of images, which raises an `InputError` for those that can't be used.
 
@@ -201,18 +219,6 @@ class PhotoDataset(InputDataset):
     def _read_mask(self, mask: Path, image_idx: int) -> Bool[np.ndarray, "H W"]:
         """Which pixels of a photo, at the size of its camera, a mask leaves in."""
         photo = self.image_filenames[image_idx]
-        try:
-            inside = read_mask(mask.read_bytes())
-        except Exception as error:  # decoders meet a damaged file with errors of many kinds
-            fault = "can't be read" if mask.exists() else "isn't there"
-            raise InputError(f"The mask {mask} doesn't fit {photo}, as it {fault}: replace it.") from error
-        width, height = photo_size(photo)
-        if inside.shape != (height, width):
-            raise InputError(
-                f"The mask {mask} doesn't fit {photo}: it is {inside.shape[1]}x{inside.shape[0]} pixels, and the photo "
-                f"{width}x{height}; scale it to that size."
-            )
-        if not inside.any():
-            raise InputError(f"The mask {mask} leaves nothing of {photo} in: replace it, or take out both.")
+        inside = read_mask_of(photo, mask, photo_size(photo))
         size = int(self.cameras.width[image_idx]), int(self.cameras.height[image_idx])
         return np.array(Image.fromarray(inside).resize(size, resample=Image.Resampling.NEAREST))

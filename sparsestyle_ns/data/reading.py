@@ -8,6 +8,7 @@ from typing import Any, Dict
 
 import numpy as np
 import torch
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
@@ -22,6 +23,8 @@ from sparsestyle_ns.data.tracks import Tracks
 from sparsestyle_ns.data.view_selection import BLENDER_VIEWS
 from sparsestyle_ns.utils.errors import InputError
 
+SPLITS = ("train_filenames", "val_filenames", "test_filenames")
+"""Entries of a `transforms.json` that list photos by their file_path; nerfstudio wants all three where it has one."""
 LENGTHS = ("fl_x", "fl_y", "w", "h")
 NUMBERS = ("cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
 ANGLE = "camera_angle_x"
@@ -32,6 +35,40 @@ def _check_blender_files(config: BlenderDataParserConfig, split: str) -> None:
     frames = read_transforms(config.data / f"transforms_{split}.json", with_angle=True)["frames"]
     first = frames[0]["file_path"].replace("./", "")
     open_photo(config.data / f"{first}.png")  # it gives all cameras their size
+
+
+def _check_capture(path: Path, is_scaled: bool) -> None:
+    """InputError for a `transforms.json` of which nerfstudio's parser would say less; `is_scaled` by its spread."""
+    content = read_transforms(path, with_angle=False)
+    check_splits(path, content)
+    frames: Dict[str, int] = {}
+    for index, frame in enumerate(content["frames"]):
+        before = frames.setdefault(frame["file_path"], index)
+        if before != index:
+            raise InputError(
+                f"Frames {before} and {index} (from 0) of {path} are both of {frame['file_path']}: drop one of them."
+            )
+    model = content.get("camera_model", "OPENCV")
+    if model not in CAMERA_MODEL_TO_TYPE:
+        raise InputError(f"{path} has the camera_model {_shown(model)}: name one of {', '.join(CAMERA_MODEL_TO_TYPE)}.")
+    places = np.array([np.array(frame["transform_matrix"], float)[:3, 3] for frame in content["frames"]])
+    if is_scaled and np.ptp(places, axis=0).max() == 0:
+        raise InputError(
+            f"All cameras of {path} stand at one place: give it photos from other places, with their poses."
+        )
+
+
+def check_splits(path: Path, content: Dict[str, Any]) -> None:
+    """Raises an `InputError` if the lists of photos to train on and to hold out aren't lists of names."""
+    for split in SPLITS:
+        names = content.get(split, [])
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise InputError(
+                f"{path} has {split} that is no list of names: list the file_path of each photo there, or take "
+                f"{', '.join(SPLITS)} out."
+            )
+    if content.get(SPLITS[0]) == []:
+        raise InputError(f"{path} lists no photo in {SPLITS[0]}: list some there, or take {', '.join(SPLITS)} out.")
 
 
 def read_scene(parser: DataParser, split: str = "train") -> DataparserOutputs:
@@ -45,7 +82,7 @@ def read_scene(parser: DataParser, split: str = "train") -> DataparserOutputs:
         _check_blender_files(config, split)
     if isinstance(config, NerfstudioDataParserConfig):
         is_file = config.data.suffix == ".json"
-        read_transforms(config.data if is_file else config.data / "transforms.json", with_angle=False)
+        _check_capture(config.data if is_file else config.data / "transforms.json", config.auto_scale_poses)
     try:
         is_colmap = isinstance(config, ColmapDataParserConfig)
         outputs = read_colmap(parser, split) if is_colmap else parser.get_dataparser_outputs(split)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Dict, List, Literal, Optional, Tuple
 
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import write_whole
 
 EffectChoice = Literal["auto", "on", "off"]
 
@@ -110,7 +111,7 @@ class Decisions:
 
     def save(self, folder: Path) -> None:
         """Writes `effects.json` into a run's folder."""
-        (folder / "effects.json").write_text(self.json(), encoding="utf-8")
+        write_whole(folder / "effects.json", self.json())
 
     def json(self) -> str:
         """The decisions as JSON: a list `effects` of name, on, measured, threshold, reason, …"""

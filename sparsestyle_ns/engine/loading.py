@@ -17,6 +17,7 @@ from sparsestyle_ns.runs.checkpoints import checkpoint_path
 from sparsestyle_ns.runs.run_folder import find_config
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.files import not_writable
 
 
 class LoadedRun(NamedTuple):
@@ -73,7 +74,10 @@ def evaluate_run(
     run.pipeline.config.vgg_weights = vgg_weights or run.pipeline.config.vgg_weights
     views = None if known is None else known_views(run.pipeline.datamanager, *known)
     report = run.pipeline.held_out_report(style_image, baked, views=views)
-    run.save_report(report, output_path)
+    try:
+        run.save_report(report, output_path)
+    except OSError as error:
+        raise not_writable(output_path, "The report", error.strerror) from error
     return report
 
 

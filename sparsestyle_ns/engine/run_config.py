@@ -1,9 +1,11 @@
 """Where a run is: a new one never takes another's folder, and one that is opened is found where it lies now."""
 
 import os
+import shutil
 import sys
+import tempfile
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Dict, Iterator, Optional
@@ -13,11 +15,12 @@ import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
 from sparsestyle_ns.pipelines.ns_commands import begin_command
-from sparsestyle_ns.runs.checkpoints import checkpoint_path, checkpoint_step, newest_checkpoint
-from sparsestyle_ns.runs.run_folder import hold_folder, read_config
+from sparsestyle_ns.runs.checkpoints import checkpoint_path, checkpoint_step, load_checkpoint, newest_checkpoint
+from sparsestyle_ns.runs.run_folder import hold_folder, is_held, read_config
 from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 from sparsestyle_ns.utils.files import write_whole
+from sparsestyle_ns.utils.interrupts import ns_option, take_away_at_end
 from sparsestyle_ns.utils.progress import say
 
 NO_TIMESTAMP = "{timestamp}"
@@ -57,11 +60,14 @@ class RunConfig(TrainerConfig):
     def open_in(self, folder: Path) -> None:
         """Makes this the config of the run in a folder: of its newest checkpoint, and of the scene that it is of.
 
-        InputError where it has no checkpoint, or its scene isn't there.
+        InputError where it has no checkpoint that can be read, or its scene isn't there.
         """
+        if is_held(folder):
+            self.relative_model_dir = _kept_copy(folder / self.relative_model_dir)
         newest = newest_checkpoint(folder / self.relative_model_dir)
         if newest is None:
             raise InputError(f"{folder} has no checkpoint yet; train it, or name another run.")
+        load_checkpoint(newest, mmap=True)  # nerfstudio, which reads it, would say of a damaged one what torch does
         record, manager = SceneRecord.load(folder), self.pipeline.datamanager
         self.run_folder, self.load_step = folder, checkpoint_step(newest)
         # A command, as `ns-render dataset --data FOLDER`, may have named another place.
@@ -93,6 +99,7 @@ class RunConfig(TrainerConfig):
         Else it goes on with that run. A config that `--load-config` has read goes on with its own run where that isn't
         finished, and else begins a new one. InputError where there is a run that this one doesn't go on with.
         """
+        self._say_what_it_leaves_out()
         self._settle_paths()
         folder, newest = self.get_base_dir(), newest_checkpoint(self.get_checkpoint_dir())
         if newest is None:
@@ -114,6 +121,24 @@ class RunConfig(TrainerConfig):
             )
         return False
 
+    def _say_what_it_leaves_out(self) -> None:
+        """Names what was typed beside `--load-config`, whose file nerfstudio takes in place of all of it.
+
+        InputError where it is of another method than the one that was asked for.
+        """
+        path, words = ns_option("load-config"), sys.argv[1:]
+        if path is None or words[0].startswith("-"):
+            return
+        if self.pipeline.decided is not None and words[0] != self.method_name:
+            raise InputError(
+                f"--load-config {path} is of a run of {self.method_name}, and {words[0]} was asked for; "
+                f"type ns-train {self.method_name} --load-config {path}."
+            )
+        others = sorted({word.split("=")[0] for word in words if word.startswith("--")})
+        others = [word for word in others if word.replace("_", "-") != "--load-config"]
+        if others:
+            say(f"Without effect beside --load-config, whose file says all: {', '.join(others)}.")
+
     def _settle_paths(self) -> None:
         """A run may be opened from another folder, and a shell leaves ~ alone behind an equals sign."""
         manager = self.pipeline.datamanager
@@ -131,16 +156,17 @@ class RunConfig(TrainerConfig):
 
     def hold_folder(self) -> None:
         """Makes the run's folder, its own until the process ends; InputError where it can't, or another has it."""
-        with self._saving():
+        with self.saving():
             hold_folder(self.get_base_dir())
 
     def write_config(self) -> None:
         """Writes config.yml into the run's folder; InputError where it can't be written."""
-        with self._saving():
+        with self.saving():
             write_whole(self.get_base_dir() / "config.yml", yaml.dump(self))
 
     @contextmanager
-    def _saving(self) -> Iterator[None]:
+    def saving(self) -> Iterator[None]:
+        """InputError where something can't be written into the run's folder before training begins."""
         try:
             yield
         except OSError as error:
@@ -169,6 +195,20 @@ class RunConfig(TrainerConfig):
                 f"{checkpoint_step(newest)}, the newest."
             )
         return checkpoint
+
+
+def _kept_copy(checkpoints: Path) -> Path:
+    """A folder with a copy of the newest checkpoint, for as long as the process runs.
+
+    A training that is under way drops a checkpoint when it has saved the next one, perhaps before this one is read.
+    """
+    copies = Path(tempfile.mkdtemp(prefix="checkpoint-"))
+    take_away_at_end(lambda: shutil.rmtree(copies, ignore_errors=True))
+    while (newest := newest_checkpoint(checkpoints)) is not None:
+        with suppress(FileNotFoundError):
+            shutil.copy(newest, copies)
+            return copies
+    return checkpoints
 
 
 def _config_being_opened() -> Optional[Path]:

@@ -89,7 +89,8 @@ class HierStyleTrainer(SparseStyleTrainer):
         super().setup(test_mode)
         release_memory()
         if comms.is_main_process():
-            save_thumbnail(self.base_dir, self._painting)
+            with self.config.saving():
+                save_thumbnail(self.base_dir, self._painting)
         if self._start_step == 0:
             with bar("Warm start", pipeline.warm_start_steps) as warming:
                 for _ in warm_start(self.pipeline, self.pipeline.task, self.optimizers):

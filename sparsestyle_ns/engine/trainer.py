@@ -30,7 +30,7 @@ from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline
 from sparsestyle_ns.runs import checkpoints
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes, checkpoint_path
-from sparsestyle_ns.runs.run_folder import remove_empty_run
+from sparsestyle_ns.runs.run_folder import COARSE_METHOD, STYLE_METHOD, release_folder, remove_empty_run
 from sparsestyle_ns.runs.scene_record import RECORD_FILE, ExpectedScene, SceneRecord, record_scene
 from sparsestyle_ns.utils.distributed import any_process, prepare_launch, share_state
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
@@ -126,11 +126,18 @@ class SparseStyleTrainer(Trainer, ABC):
         if comms.is_main_process():
             parts = manager.train_dataparser_outputs, self.pipeline.effects, manager.measured_views()
             self.record = self.completed(record_scene(manager.config.data, *parts))
-            self.record.save(self.base_dir)
-            self._save_decisions()
+            with self.config.saving():
+                self.record.save(self.base_dir)
+                self._save_decisions()
 
     def _expect_what_was(self, before: Dict[str, Any]) -> None:
         """Takes from a checkpoint what training goes on with; InputError where the command line says something else."""
+        is_style = self.config.method_name.startswith(STYLE_METHOD)
+        if is_style != any(name.startswith("_model.residual.") for name in before["pipeline"]):
+            other, advice = (
+                (COARSE_METHOD, "name its run with --coarse-run") if is_style else (STYLE_METHOD, "go on with that")
+            )
+            raise InputError(f"The checkpoint {self.config.resumed_checkpoint()} is of {other}; {advice} instead.")
         done, total = before["step"] + 1, self.config.max_num_iterations
         if done >= total:
             of = f"The checkpoint is of iteration {done}"
@@ -211,11 +218,14 @@ class SparseStyleTrainer(Trainer, ABC):
             with ExitStack() as self._bars:
                 self._bar = self._bars.enter_context(shown)
                 super().train()
+        except OSError as error:  # what nerfstudio writes: events and the dataparser's transform
+            raise self._cant_save("What training writes", error) from error
         except TrainingInterruptedError:
             self.save_checkpoint(self.step)
             say(f"Stopped after iteration {self.step + 1} of {total}; the checkpoint is saved.")
         finally:
             signal.signal(signal.SIGINT, former)
+            release_folder(self.base_dir)
         return not self._interrupted
 
     def _after_train(self) -> None:
@@ -226,7 +236,8 @@ class SparseStyleTrainer(Trainer, ABC):
 
     @check_viewer_enabled
     def _train_complete_viewer(self) -> None:
-        """The viewer stays until Ctrl-C, which ends the command as if there were none."""
+        """The viewer stays until Ctrl-C, which ends the command as if there were none; another may train on by then."""
+        release_folder(self.base_dir)
         self.finish()
         if self._interrupted:  # while the last checkpoint was saved
             raise StoppedByCtrlC
@@ -333,16 +344,25 @@ class SparseStyleTrainer(Trainer, ABC):
         try:
             checkpoints.write_checkpoint(target, step, state, self.optimizers, self.notes(), self.grad_scaler)
         except (OSError, RuntimeError) as error:  # torch's writer makes a RuntimeError of some OSErrors
-            raise InputError(
-                f"The checkpoint of iteration {step + 1} can't be saved in {self.checkpoint_dir} ({error}); the former "
-                "one is still there. Make room, and go on from it with --load-dir."
-            ) from error
+            raise self._cant_save(f"The checkpoint of iteration {step + 1}", error) from error
         self._kept_step = step
         if self.config.save_only_latest_checkpoint and not suspect and self._own_checkpoint not in (None, target):
             self._own_checkpoint.unlink(missing_ok=True)
         self._own_checkpoint = target
         if self.pipeline.effects != self._saved_decisions:
             self._save_decisions()
+
+    def _cant_save(self, what: str, error: BaseException) -> InputError:
+        """An error that says why something of the run can't be written, and what is saved of it."""
+        while not isinstance(error, OSError) and error.__context__ is not None:
+            error = error.__context__
+        advice = "nothing was saved before, so make room on the disk and begin anew"
+        if self._kept_step is not None:
+            advice = (
+                f"iteration {self._kept_step + 1} is saved, so make room on the disk and go on from it with --load-dir"
+            )
+        reason = getattr(error, "strerror", None) or str(error)
+        return InputError(f"{what} can't be saved in {self.base_dir} ({reason})", advice)
 
 
 class CoarseFewShotTrainer(SparseStyleTrainer):

@@ -4,7 +4,6 @@ The points are those of the training views, not of random rays, and every vertex
 Importing this module raises an `InputError` where Open3D can't be loaded.
 """
 
-import tempfile
 from pathlib import Path
 from typing import Tuple
 
@@ -19,6 +18,7 @@ from sparsestyle_ns.export.points import Points, joined, likeness, print_likenes
 from sparsestyle_ns.export.stylised_scene import StylisedScene
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_output
+from sparsestyle_ns.utils.ply import RGB, encode_ply, floats
 
 try:
     import open3d
@@ -42,7 +42,8 @@ def export_mesh(scene: StylisedScene, output_path: Path, glb: bool = False) -> N
     """Writes a mesh with coloured vertices as PLY, or as glTF, and prints how well it shows each training view."""
     pictures, parts = surfaces(scene)
     mesh = poisson_mesh(joined(parts))
-    content = encode_gltf(colored_mesh(mesh), scene.model.space) if glb else encode_mesh(mesh)
+    colored = colored_mesh(mesh)
+    content = encode_gltf(colored, scene.model.space) if glb else encode_mesh(colored)
     write_output(output_path, content, "The mesh", "scene.glb" if glb else "scene.ply")
     frame = "glTF's coordinates, y up" if glb else "nerfstudio's coordinates"
     print(f"{len(mesh.vertices):,} vertices, {len(mesh.triangles):,} triangles, in {frame}")
@@ -69,17 +70,19 @@ def poisson_mesh(points: Points) -> open3d.geometry.TriangleMesh:
     return mesh
 
 
-def encode_mesh(mesh: open3d.geometry.TriangleMesh) -> bytes:
+def encode_mesh(mesh: ColoredMesh) -> bytes:
     """A binary PLY file with the vertices' colours and normals."""
-    mesh.compute_vertex_normals()
-    with tempfile.TemporaryDirectory() as folder:  # Open3D only writes into files
-        path = Path(folder) / "mesh.ply"
-        open3d.io.write_triangle_mesh(str(path), mesh)
-        return path.read_bytes()
+    rows = np.empty(len(mesh.positions), dtype=[("place", "<f4", 3), ("normal", "<f4", 3), ("color", "u1", 3)])
+    rows["place"], rows["normal"] = mesh.positions, mesh.normals
+    rows["color"] = np.rint(255.0 * np.clip(mesh.colors, 0.0, 1.0))
+    faces = np.empty(len(mesh.triangles), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, mesh.triangles
+    properties = (*floats("x", "y", "z", "nx", "ny", "nz"), *RGB)
+    return encode_ply(("vertex", properties, rows), ("face", ("list uchar int vertex_indices",), faces))
 
 
 def colored_mesh(mesh: open3d.geometry.TriangleMesh) -> ColoredMesh:
-    """The same mesh in numpy's arrays."""
+    """The same mesh in numpy's arrays, which needs no Open3D to be written."""
     mesh.compute_vertex_normals()
     parts = (mesh.vertices, mesh.vertex_normals, mesh.vertex_colors, mesh.triangles)
     return ColoredMesh(*map(np.asarray, parts))

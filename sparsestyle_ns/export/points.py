@@ -16,6 +16,7 @@ from sparsestyle_ns.metrics.image import psnr
 from sparsestyle_ns.rendering.render import straight_color
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_output
+from sparsestyle_ns.utils.ply import RGB, encode_ply, floats
 
 MAX_JUMP = 0.1
 """Share by which depth may differ between neighbouring pixels on one surface."""
@@ -37,7 +38,7 @@ def export_points(scene: StylisedScene, output_path: Path) -> None:
     points = joined(parts)
     if len(points.positions) == 0:
         raise InputError("The views show no surface point, so there is nothing to write; train the coarse field more.")
-    write_output(output_path, encode_ply(points), "The points", "scene.ply")
+    write_output(output_path, encode_points(points), "The points", "scene.ply")
     print(f"{len(points.positions):,} points, in nerfstudio's coordinates")
     if len(parts) > 1:
         print("Each view as the points of all others show it, one pixel each, against the exact render:")
@@ -80,15 +81,12 @@ def joined(parts: Sequence[Points]) -> Points:
     return Points(*map(torch.cat, zip(*parts, strict=True)))
 
 
-def encode_ply(points: Points) -> bytes:
+def encode_points(points: Points) -> bytes:
     """A binary PLY file: x, y, z as floats, red, green, blue as bytes."""
     rows = np.empty(len(points.positions), dtype=[("position", "<f4", 3), ("color", "u1", 3)])
     rows["position"] = points.positions.numpy()
     rows["color"] = (255.0 * points.colors).round().byte().numpy()
-    kinds = ("float x", "float y", "float z", "uchar red", "uchar green", "uchar blue")
-    properties = [f"property {kind}" for kind in kinds]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties, "end_header", ""]
-    return "\n".join(lines).encode() + rows.tobytes()
+    return encode_ply(("vertex", (*floats("x", "y", "z"), *RGB), rows))
 
 
 class Likeness(NamedTuple):

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestyle_ns.export.gaussians import Gaussians
+from sparsestyle_ns.utils.ply import encode_ply, floats
 
 CONSTANT_HARMONIC = 0.5 / math.sqrt(math.pi)
 """Of degree 0; a colour is 0.5 more than this times its coefficient."""
@@ -34,6 +35,4 @@ def encode_splats(gaussians: Gaussians, small: bool = False) -> bytes:
     rows[:, 0:3], rows[:, 6:9] = gaussians.means.numpy(), coefficients(gaussians.colors).numpy()
     rows[:, -8] = gaussians.logits.numpy()
     rows[:, -7:-4], rows[:, -4:] = gaussians.log_scales.numpy(), rotations.numpy()
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    lines += [*(f"property float {name}" for name in names), "end_header", ""]
-    return "\n".join(lines).encode() + rows.tobytes()
+    return encode_ply(("vertex", floats(*names), rows))

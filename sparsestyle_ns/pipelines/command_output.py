@@ -6,14 +6,17 @@ therefore run once more within itself, from where it has read the run's config.y
 whether it comes to its end.
 """
 
+import re
 import signal
 import sys
+import traceback
 from pathlib import Path
 from typing import Any, List, Optional
 
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import all_or_nothing, check_writable, not_writable, numbered
 from sparsestyle_ns.utils.interrupts import ending_on, ns_command, stop_if_pressed
+from sparsestyle_ns.utils.ply import is_whole_ply
 
 SCRIPTS = {"render": "What is rendered", "exporter": "What is exported", "eval": "The figures"}
 """nerfstudio's modules of commands that write something, and what that is."""
@@ -22,6 +25,8 @@ FILMS = (".mp4", ".m4v", ".mov", ".mkv")
 FILES = (*FILMS, ".json", ".ply", ".obj", ".mtl", ".png")
 """Kinds of files that its commands write, beside folders."""
 TEXTURED_MESH = ("mesh.obj", "material_0.mtl", "material_0.png")
+LONGEST_REASON = 200
+"""Characters of another library's error that are quoted."""
 _under_way: List[Any] = []
 
 
@@ -106,6 +111,23 @@ def _is_taken(path: Path) -> bool:
     return path.exists() and not is_free_folder
 
 
+def _refuse(command: Any, error: Exception) -> None:
+    """Raises an InputError for an error that none of this package's own code has met: some option asks too much."""
+    frames = traceback.extract_tb(error.__traceback__)
+    if any(Path(__file__).parents[1] in Path(frame.filename).parents for frame in frames[1:]):
+        return
+    if "Surface level must be within" in str(error):
+        raise InputError(
+            "There is no surface in the box from --bounding-box-min to --bounding-box-max, as far as the photos see; "
+            "place it where the scene is, or take more cells with --resolution."
+        ) from error
+    reason = " ".join(re.sub(r"\x1b\[[0-9;]*m", "", str(error)).split())[:LONGEST_REASON] or "no reason given"
+    raise InputError(
+        f"nerfstudio's {type(command).__name__} has failed ({type(error).__name__}: {reason}); leave out options that "
+        "aren't needed, or give smaller numbers."
+    ) from error
+
+
 def run_whole(command: Any, script: str) -> None:
     """Runs a command that has just begun, the process's own, as a whole, and ends the process; else does nothing.
 
@@ -120,15 +142,18 @@ def run_whole(command: Any, script: str) -> None:
     with ending_on(signal.SIGTERM, signal.SIGHUP), all_or_nothing(places):
         try:
             command.main()
-        except (OSError, RuntimeError) as error:
+        except Exception as error:
             stop_if_pressed()  # in a terminal Ctrl-C ends ffmpeg, too, and so a film that is being written
             if isinstance(error, BrokenPipeError) or str(error).startswith("Error writing"):
                 raise not_writable(first, what, "ffmpeg has ended", flag) from error
             if isinstance(error, OSError):
                 raise not_writable(first, what, error.strerror, flag) from error
+            if str(error).startswith("Error encountered while export"):  # PyMeshLab's
+                raise not_writable(first, what, " ".join(str(error).split(": ")[-1].split()), flag) from error
+            _refuse(command, error)
             raise
-        # Open3D writes no PLY file, and goes on, where it can't.
-        unwritten = [path for path in places if path.suffix == ".ply" and not path.exists()]
-        if unwritten:
-            raise not_writable(unwritten[0], what, "Open3D has failed", flag)
+        # What writes PLY files for nerfstudio says nothing where it can't, or where the disk is full by then.
+        for path in (each for each in places if each.suffix == ".ply"):
+            if not path.exists() or not is_whole_ply(path):
+                raise not_writable(path, what, "it is cut short" if path.exists() else "it isn't there", flag)
     raise SystemExit(0)

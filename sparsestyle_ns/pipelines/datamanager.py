@@ -32,9 +32,10 @@ from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.effects.matched_depth import MatchedRays, matched_rays
 from sparsestyle_ns.effects.pose_refinement import CameraRefinement, carried_along
 from sparsestyle_ns.effects.scene import Scene
-from sparsestyle_ns.runs.scene_record import ExpectedScene, SceneRecord, record_scene
+from sparsestyle_ns.runs.scene_record import ExpectedScene, SceneRecord, in_words, record_scene
 from sparsestyle_ns.utils.distributed import num_processes
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.progress import say
 
 
 @dataclass
@@ -170,6 +171,11 @@ class FewShotDataManager(VanillaDataManager[PhotoDataset]):
         if not outputs.image_filenames:
             CONSOLE.print("No view is held out; evaluating on the training views.")
             outputs = self.train_dataparser_outputs
+        else:
+            trained = set(self.train_dataparser_outputs.image_filenames)
+            shared = [path.name for path in outputs.image_filenames if path in trained]
+            if shared:
+                say(f"Held out, but trained on as well, so that figures say less: {in_words(shared)}.")
         return self._dataset(outputs)
 
     def _dataset(self, outputs: DataparserOutputs) -> PhotoDataset:

@@ -21,7 +21,7 @@ from sparsestyle_ns.evaluation.held_out import HeldOutReport, evaluate_held_out
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.pipelines.command_output import running_command
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, FewShotDataManagerConfig
-from sparsestyle_ns.pipelines.export_command import check_box
+from sparsestyle_ns.pipelines.export_command import check_export_of
 from sparsestyle_ns.pipelines.nerfstudio_options import unused_in_training, unused_of_scene
 from sparsestyle_ns.pipelines.render_command import prepare_render
 from sparsestyle_ns.style.backbone import Backbone
@@ -156,4 +156,4 @@ class CheckedPipeline(VanillaPipeline):
                 f"them {wrong[0]}; load it with the config.yml of its own run."
             )
         super().load_pipeline(found, step)
-        check_box(running_command("exporter"), self)
+        check_export_of(running_command("exporter"), self)

@@ -3,7 +3,7 @@
 import io
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import List, Sequence, Tuple
+from typing import List, Optional, Sequence, Tuple
 
 from PIL import ExifTags, Image, UnidentifiedImageError
 
@@ -30,6 +30,7 @@ class Photo:
         orientation: EXIF's, from 1 (upright) to 8; 1 where it says nothing.
         upright: whether `image` was turned by that; else it has the pixels as they are stored.
         exif: all that EXIF says.
+        mask: grey, turned as `image` is, and black where that isn't to be trained on; None where it has none.
     """
 
     path: Path
@@ -37,6 +38,7 @@ class Photo:
     orientation: int = 1
     upright: bool = True
     exif: Image.Exif = field(default_factory=Image.Exif)
+    mask: Optional[Image.Image] = None
 
 
 @dataclass(frozen=True)
@@ -49,10 +51,10 @@ class Framing:
     corner: Tuple[int, int]
     size: Size
 
-    def apply(self, image: Image.Image) -> Image.Image:
-        """The photo as it goes into the scene."""
+    def apply(self, image: Image.Image, resample: Image.Resampling = Image.Resampling.LANCZOS) -> Image.Image:
+        """The photo, or its mask, as it goes into the scene."""
         if image.size != self.scaled:
-            image = image.resize(self.scaled, Image.Resampling.LANCZOS)
+            image = image.resize(self.scaled, resample)
         left, top = self.corner
         return image.crop((left, top, left + self.size[0], top + self.size[1]))
 
@@ -144,3 +146,26 @@ def write_photos(photos: Sequence[Photo], framings: Sequence[Framing], folder: P
     for name, photo, framing in zip(names, photos, framings, strict=True):
         framing.apply(photo.image).save(folder / name, quality=JPEG_QUALITY, subsampling=0)
     return names
+
+
+def mask_name(name: str) -> str:
+    """Where a scene has the mask of the photo with a name, seen from its folder."""
+    return f"masks/{Path(name).stem}.png"
+
+
+def write_masks(photos: Sequence[Photo], framings: Sequence[Framing], folder: Path, names: Sequence[str]) -> None:
+    """Writes the masks of photos into a scene's folder if any has one; that of a photo without one leaves all of it in.
+
+    `InputError` where a photo's frame has no pixel that its mask leaves in.
+    """
+    if all(photo.mask is None for photo in photos):
+        return
+    for name, photo, framing in zip(names, photos, framings, strict=True):
+        mask = framing.apply(photo.mask or Image.new("L", photo.image.size, 255), Image.Resampling.NEAREST)
+        if mask.getbbox() is None:
+            raise InputError(
+                f"The mask of {photo.path} leaves nothing in of the {mask.width} × {mask.height} pixels that the scene "
+                "has of it; replace it, or take the photo out."
+            )
+        (folder / mask_name(name)).parent.mkdir(exist_ok=True)
+        mask.save(folder / mask_name(name))

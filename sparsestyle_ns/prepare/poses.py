@@ -3,24 +3,26 @@
 import json
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Optional, Sequence, Union
 
 import numpy as np
+from PIL import Image
 
 from sparsestyle_ns.data.estimated import TRANSFORMS
 from sparsestyle_ns.data.llff import read_poses_bounds
-from sparsestyle_ns.data.reading import check_lenses, read_transforms
-from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, Photo, Size, read_photo
+from sparsestyle_ns.data.photos import read_mask_of
+from sparsestyle_ns.data.reading import SPLITS, check_lenses, check_splits, read_transforms
+from sparsestyle_ns.prepare.framing import MIN_PHOTOS, Framing, Photo, Size, mask_name, read_photo
 from sparsestyle_ns.utils.errors import InputError
+from sparsestyle_ns.utils.pictures import as_upright
 
 POSES_BOUNDS = "poses_bounds.npy"
 ASPECT_TOLERANCE = 0.02
 """Share by which the aspect of a photo may differ from that of its pose: sizes are whole pixels."""
-SPLITS = ("train_filenames", "val_filenames", "test_filenames")
-"""Entries of a `transforms.json` that list photos by their file_path; nerfstudio wants all three where it has one."""
-PIXEL_MAPS = ("mask_path", "depth_file_path")
-"""Entries of a frame that are pictures of the photo's old size."""
+MASK, DEPTH = "mask_path", "depth_file_path"
+"""Entries of a frame that are pictures of the photo's old size: masks come along, depth maps don't."""
 SHARED = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "ply_file_path")
 """Entries of all frames together that hold no longer once each frame has intrinsics of its own."""
 
@@ -59,6 +61,10 @@ class LLFFPoses:
         height, width = self.rows[index, [4, 9]]
         return round(width), round(height)
 
+    def mask(self, index: int) -> Optional[Path]:
+        """Where a photo's mask is; the file knows of none."""
+        return None
+
     def write(self, folder: Path, names: Sequence[str], framings: Sequence[Framing]) -> None:
         """Writes the file for photos with new names and sizes into a folder that has them in `images`."""
         rows = self.rows.copy()
@@ -76,14 +82,12 @@ class TransformsPoses:
         self.path = path
         self.content: Dict[str, Any] = read_transforms(path, with_angle=False)
         check_lenses(path, self.content)
-        for split in SPLITS:
-            names = self.content.get(split, [])
-            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        check_splits(path, self.content)
+        for index, frame in enumerate(self.content["frames"]):
+            if not isinstance(frame.get(MASK, ""), str):
                 raise InputError(
-                    f"{path} has {split} that is no list of names: list the file_path of each photo there, or take "
-                    f"{', '.join(SPLITS)} out."
+                    f"Frame {index} (from 0) of {path} has a {MASK} that is no name: correct it or drop it."
                 )
-        for frame in self.content["frames"]:
             if not any(key in part for part in (frame, self.content) for key in ("fl_x", "camera_angle_x")):
                 raise InputError(f"{path} has no focal length (fl_x) for {frame['file_path']}; add it, in pixels.")
         self.used: List[Dict[str, Any]] = []
@@ -113,6 +117,9 @@ class TransformsPoses:
         without_pose = [path.name for path in found if path not in frames]
         if without_photo:
             print(f"Frames of {self.path} whose photos aren't there, and are left out: {', '.join(without_photo)}")
+        without_mask = [path.name for path in found if path in frames and MASK not in frames[path]]
+        if any(MASK in frame for frame in self.used) and without_mask:
+            print(f"Photos without a mask in {self.path}, of which nothing is left out: {', '.join(without_mask)}")
         if without_pose:
             print(f"Photos without a frame in {self.path}, which are left out: {', '.join(without_pose)}")
 
@@ -163,19 +170,24 @@ class TransformsPoses:
         width, height = (self._value(index, key) for key in ("w", "h"))
         return None if width is None or height is None else (round(width), round(height))
 
+    def mask(self, index: int) -> Optional[Path]:
+        """Where a photo's mask is; None where it has none."""
+        name = self.used[index].get(MASK)
+        return None if name is None else self.path.parent / name
+
     def _value(self, index: int, key: str, default: Optional[float] = None) -> Optional[float]:
         return self.used[index].get(key, self.content.get(key, default))
 
     def write(self, folder: Path, names: Sequence[str], framings: Sequence[Framing]) -> None:
         """See `LLFFPoses.write`. Distortion is in units of the focal length, and stays as it is."""
         names = [f"images/{name}" for name in names]
-        left_out = sorted({key for frame in self.used for key in PIXEL_MAPS if key in frame})
-        if left_out:
-            print(f"Left out of the scene, as they are for photos of the former size: {' and '.join(left_out)}")
-        frames = []
+        if any(DEPTH in frame for frame in self.used):
+            print(f"Left out of the scene, as they are for photos of the former size: {DEPTH}")
+        has_masks, frames = any(MASK in frame for frame in self.used), []
         for index, (frame, name, framing) in enumerate(zip(self.used, names, framings, strict=True)):
-            kept = {key: value for key, value in frame.items() if key not in PIXEL_MAPS}
-            frames.append({**kept, "file_path": name, **self._intrinsics(index, framing)})
+            kept = {key: value for key, value in frame.items() if key != DEPTH}
+            mask = {MASK: mask_name(name)} if has_masks else {}
+            frames.append({**kept, **mask, "file_path": name, **self._intrinsics(index, framing)})
         kept = {key: value for key, value in self.content.items() if key not in SHARED}
         content = {**kept, **self._splits(names), "frames": frames}
         (folder / TRANSFORMS).write_text(json.dumps(content, indent=2) + "\n")
@@ -219,15 +231,33 @@ def read_for_pose(path: Path, poses: Optional[Poses], index: int) -> Photo:
         return read_photo(path)
     stored, expected = read_photo(path, upright=False), poses.size(index)
     if expected is None or fits(stored.image.size, expected):
-        return stored
+        return _with_mask(stored, poses.mask(index))
     turned = read_photo(path)
     if fits(turned.image.size, expected):
-        return turned
+        return _with_mask(turned, poses.mask(index))
     width, height = stored.image.size
     raise InputError(
         f"{path} is {width} × {height} pixels, which is no scaled version of the {expected[0]} × {expected[1]} that "
         f"its pose in {poses.path} is for; use the photo that the pose was found with."
     )
+
+
+def _with_mask(photo: Photo, mask: Optional[Path]) -> Photo:
+    """A photo with its mask, if it has one, which is for the photo as it is stored, or as it is used."""
+    if mask is None:
+        return photo
+    size, as_stored = photo.image.size, photo.image.size[:: -1 if photo.upright and photo.orientation > 4 else 1]
+    inside = read_mask_of(photo.path, mask, size, as_stored)
+    picture = Image.fromarray(np.where(inside, 255, 0).astype(np.uint8))
+    return replace(photo, mask=picture if picture.size == size else as_upright(picture, photo.orientation))
+
+
+def say_what_masks_are_unused(photos: Path, read: Sequence[Photo]) -> None:
+    """Prints that masks in a folder of their own beside photos have no effect where no file says whose they are."""
+    around = (photos, photos.parent) if photos.name.startswith("images") else (photos,)
+    folders = [folder / "masks" for folder in around if (folder / "masks").is_dir()]
+    if folders and all(photo.mask is None for photo in read):
+        print(f"Not used: {folders[0]}; a photo's mask is what its frame in a {TRANSFORMS} names as {MASK}")
 
 
 def say_what_is_turned(photos: Sequence[Photo], poses: Optional[Poses]) -> None:

@@ -9,8 +9,8 @@ from typing import List, Literal, Optional, Sequence, Tuple, Union
 from sparsestyle_ns.engine.hints import finish
 from sparsestyle_ns.prepare.diagnosis import compare, findings
 from sparsestyle_ns.prepare.estimation import EstimatedPoses, estimate_poses
-from sparsestyle_ns.prepare.framing import Framing, Photo, find_photos, frame_photos, write_photos
-from sparsestyle_ns.prepare.poses import Poses, find_poses, read_for_pose, say_what_is_turned
+from sparsestyle_ns.prepare.framing import Framing, Photo, find_photos, frame_photos, write_masks, write_photos
+from sparsestyle_ns.prepare.poses import Poses, find_poses, read_for_pose, say_what_is_turned, say_what_masks_are_unused
 from sparsestyle_ns.prepare.prepare_options import PrepareOptions
 from sparsestyle_ns.prepare.selection import without_useless
 from sparsestyle_ns.prepare.video import VIDEO_SUFFIXES, choose_frames
@@ -86,6 +86,7 @@ def _read_photos(photos: Path, source: PoseSource) -> Tuple[List[Photo], Optiona
         paths = poses.photos(paths)
     read = [read_for_pose(path, poses, index) for index, path in enumerate(track(paths, "Reading photos"))]
     say_what_is_turned(read, poses)
+    say_what_masks_are_unused(paths[0].parent, read)
     return (without_useless(read) if poses is None else read), poses
 
 
@@ -99,6 +100,7 @@ def _write(
                 scene = Path(folder) / "scene"
                 scene.mkdir()
                 names = write_photos(photos, framings, scene / "images")
+                write_masks(photos, framings, scene, names)
                 poses.write(scene, names, framings)
                 if output.exists():
                     output.rmdir()

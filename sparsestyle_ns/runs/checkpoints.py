@@ -51,10 +51,13 @@ def newest_checkpoint(folder: Path) -> Optional[Path]:
     return max(checkpoints, key=checkpoint_step, default=None)
 
 
-def load_checkpoint(path: Path) -> Dict[str, Any]:
-    """What is in a checkpoint, with its tensors on the CPU; InputError where it can't be read."""
+def load_checkpoint(path: Path, mmap: bool = False) -> Dict[str, Any]:
+    """What is in a checkpoint, with its tensors on the CPU; InputError where it can't be read.
+
+    With `mmap` they stay in the file until they are used, so that no time is lost where only that is asked.
+    """
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
     except Exception as error:  # a damaged archive can fail in many ways
         raise InputError(
             f"The checkpoint {path} can't be read, it may have been cut short in copying: copy it again, or delete it "

@@ -44,7 +44,7 @@ _held: Dict[Path, int] = {}
 
 
 def hold_folder(folder: Path) -> None:
-    """Makes a run's folder, and keeps it for this process until that ends, however it does.
+    """Makes a run's folder, and keeps it for this process until `release_folder`, or its end, however that comes.
 
     InputError where another process keeps it; OSError where it can't be made.
     """
@@ -63,6 +63,30 @@ def hold_folder(folder: Path) -> None:
         os.close(descriptor)
         return
     _held[folder.resolve()] = descriptor
+
+
+def release_folder(folder: Path) -> None:
+    """Lets other processes write into a run's folder again, if this one has kept it."""
+    descriptor = _held.pop(folder.resolve(), None)
+    if descriptor is not None:
+        fcntl.flock(descriptor, fcntl.LOCK_UN)  # also where a process that was forked meanwhile has the file open
+        os.close(descriptor)
+
+
+def is_held(folder: Path) -> bool:
+    """Whether another process keeps a run's folder; False where that can't be told."""
+    if folder.resolve() in _held:
+        return False
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        pass
+    finally:
+        os.close(descriptor)
+    return False
 
 
 def remove_empty_run(folder: Path, around: Sequence[Path]) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import digest
 from sparsestyle_ns.utils.pictures import decode, orientation_of
+from sparsestyle_ns.utils.progress import say
 
 SMALLEST_SIDE, THUMBNAIL_SIDE = 8, 200
 """Pixels: what each side of a painting must have, and the longer side of its thumbnail."""
@@ -78,7 +79,8 @@ def _decode(data: bytes, name: Union[str, Path]) -> Float[Tensor, "3 H W"]:
         with Image.open(io.BytesIO(data)) as image:
             # Pillow can say what is wrong with a damaged file; OpenCV only that there is no image.
             image.load()
-            pixels = _turn_upright(_to_rgb(decode(image, data)), orientation_of(image))
+            frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)  # a telephone's second one is small
+            stored, orientation = decode(image, data), orientation_of(image)
     except UnidentifiedImageError as error:
         raise InputError(
             f"The style image {name} is in no known image format: give a JPEG, PNG or WebP file."
@@ -88,12 +90,25 @@ def _decode(data: bytes, name: Union[str, Path]) -> Float[Tensor, "3 H W"]:
         raise InputError(
             f"The style image {name} cannot be read as an image ({error}): give an undamaged JPEG, PNG or WebP file."
         ) from error
+    pixels = _turn_upright(_to_rgb(stored), orientation)
     height, width = pixels.shape[:2]
     if min(height, width) < SMALLEST_SIDE:
         raise InputError(
             f"The style image {name} is {width} × {height} pixels: give one of at least {SMALLEST_SIDE} pixels a side."
         )
+    if stored.shape[2] == 4:
+        _look_at_opacity(stored[..., 3], name)
+    if frames > 1:
+        say(f"The style image {name} has {frames} frames; its first is the painting.")
     return torch.from_numpy(pixels).permute(2, 0, 1).contiguous().clamp(0, 1)
+
+
+def _look_at_opacity(opacity: Shaped[np.ndarray, "H W"], name: Union[str, Path]) -> None:
+    """Says that a painting is transparent in places; an `InputError` where it is so all over."""
+    if opacity.max() == 0:
+        raise InputError(f"The style image {name} is transparent all over: give one that shows something.")
+    if opacity.min() < np.iinfo(opacity.dtype).max:
+        say(f"The style image {name} is transparent in places, and laid over white.")
 
 
 def _to_rgb(pixels: Shaped[np.ndarray, "H W channels"]) -> Float[np.ndarray, "H W 3"]:

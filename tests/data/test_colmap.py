@@ -1,6 +1,8 @@
 """COLMAP models at nerfstudio's edges: photos over 1,600 pixels, and names with spaces in models of text."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -83,3 +85,23 @@ def test_reduced_photos_that_are_there_are_read(tmp_path):
     outputs = read_scene(config.setup())
     assert int(outputs.cameras.width[0]) == 8
     assert outputs.image_filenames[0] == tmp_path / "images_2" / NAMES[0]
+
+
+def test_a_model_somewhere_else_is_named_with_the_flag_that_leads_there(tmp_path):
+    config = write_model(tmp_path)
+    advice = r"There is no COLMAP model at .*colmap/sparse/0; there is one at (\S+): add --colmap-path (\S+) behind"
+    with pytest.raises(InputError, match=advice) as refused:
+        read_scene(replace(config, colmap_path=ColmapDataParserConfig().colmap_path).setup())
+    place = re.search(advice, str(refused.value))[2]
+    assert len(read_scene(replace(config, colmap_path=place).setup()).image_filenames) == len(NAMES)
+    (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "7")
+    with pytest.raises(InputError, match="say where it is behind the word colmap, as by --colmap-path sparse/0"):
+        read_scene(config.setup())
+
+
+@pytest.mark.parametrize("names", [NAMES, ["a.png", "b.png", "c.png", "d.png"]])
+def test_a_scene_may_be_named_from_where_one_is(tmp_path, monkeypatch, names):
+    write_model(tmp_path / "capture", names)
+    monkeypatch.chdir(tmp_path)
+    config = ColmapDataParserConfig(data=Path("capture"), colmap_path=Path("sparse/0"), eval_mode="all")
+    assert [path.name for path in read_scene(config.setup()).image_filenames] == names

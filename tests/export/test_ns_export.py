@@ -75,7 +75,28 @@ def test_an_export_never_takes_the_place_of_a_file(kind, settings, name, tmp_pat
         ("ExportMarchingCubesMesh", {}, "ns-export poisson --normal-method open3d"),
         ("ExportPointCloud", {}, "no normals of its own; add --normal-method open3d"),
         ("ExportPoissonMesh", {"normal_method": "open3d", "num_points": 0}, "--num-points is 0; give 1 or more"),
+        (
+            "ExportPointCloud",
+            {"normal_method": "open3d", "num_points": 9, "num_rays_per_batch": 9},
+            "--num-points is 9; give 100 or more",
+        ),
         ("ExportTSDFMesh", {"downscale_factor": 0}, "--downscale-factor is 0; give 1 or more"),
+        (
+            "ExportTSDFMesh",
+            {"resolution": 1},
+            "--resolution is 1 1 1; give one number of cells, or three, each 2 or more",
+        ),
+        ("ExportTSDFMesh", {"resolution": [8, 9]}, "--resolution is 8 9; give one number of cells, or three"),
+        (
+            "ExportTSDFMesh",
+            {"bounding_box_max": (-1, 1, 1)},
+            "--bounding-box-min isn't below --bounding-box-max in x, y",
+        ),
+        ("ExportTSDFMesh", {"target_num_faces": 0}, "--target-num-faces is 0; give 4 or more"),
+        ("ExportTSDFMesh", {"num_pixels_per_side": 0}, "--num-pixels-per-side is 0; give 8 or more"),
+        ("ExportTSDFMesh", {"refinement_epsilon": -1.0}, "--refinement-epsilon is -1.0; give 0.0 or more"),
+        ("ExportTSDFMesh", {"use_bounding_box": False, "bounding_box_max": (-1, 1, 1), "target_num_faces": None}, None),
+        ("ExportPointCloud", {"normal_method": "open3d", "std_ratio": 0.0}, "--std-ratio is 0.0; give 0.001 or more"),
         ("ExportCameraPoses", {}, None),
     ],
 )
@@ -98,6 +119,15 @@ def test_a_box_that_isnt_whole_is_named(tmp_path, capsys):
     assert "have an effect only together" in " ".join(capsys.readouterr().out.split())
 
 
+def test_options_that_nerfstudio_doesnt_read_are_named(tmp_path, capsys):
+    from nerfstudio.scripts import exporter
+
+    options = {"bounding_box_min": (-2.0, -2.0, -2.0), "normal_method": "open3d"}
+    check_export(exporter.ExportPoissonMesh(load_config=None, output_dir=tmp_path, **options))
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "--bounding-box-min has no effect here: ns-export poisson takes points from everywhere, or from" in printed
+
+
 BOX = "--obb-rotation 0 0 0 --obb-scale 1 1 1"
 
 
@@ -107,7 +137,20 @@ BOX = "--obb-rotation 0 0 0 --obb-scale 1 1 1"
         ("gaussian-splat --output-dir {tmp}/new/folder", 1, set()),
         ("pointcloud --normal-method open3d --num-points 100 --depth-output-name foo --output-dir {tmp}/new", 1, set()),
         (f"pointcloud --normal-method open3d {BOX} --obb-center 90 90 90 --output-dir {{tmp}}/new", 1, set()),
+        ("tsdf --downscale-factor 100 --output-dir {tmp}/new", 1, set()),
+        (
+            "tsdf --resolution 8 --bounding-box-min 50 50 50 --bounding-box-max 60 60 60 --output-dir {tmp}/new",
+            1,
+            set(),
+        ),
+        ("tsdf --resolution 100000 --output-dir {tmp}/new", 1, set()),  # more memory than any machine has
+        ("tsdf --rgb-output-name depth --output-dir {tmp}/new", 1, set()),
         ("cameras --output-dir {tmp}/taken/new", 1, set()),
+        (
+            "tsdf --downscale-factor 1 --resolution 16 --texture-method tsdf --output-dir {tmp}/new",
+            0,
+            {"new", "tsdf_mesh.ply"},
+        ),
         ("cameras --output-dir {tmp}/new", 0, {"new", "transforms_train.json", "transforms_eval.json"}),
     ],
 )
@@ -118,6 +161,7 @@ def test_an_export_leaves_its_files_or_nothing(words, status, left, runs, tmp_pa
     ending = finish([*command, "--load-config", runs.style / "config.yml"], tmp_path / "log")
     assert ending.status == status, ending.printed[-3000:]
     assert "Traceback" not in ending.printed
+    assert status == 0 or ending.printed.splitlines()[-1].startswith("Error: ")
     assert {path.name for path in (tmp_path / "made").rglob("*")} == {"taken", *left}
 
 

@@ -16,7 +16,7 @@ from sparsestyle_ns.export.points import (
     Points,
     at_edge,
     cross_likeness,
-    encode_ply,
+    encode_points,
     export_points,
     joined,
     likeness,
@@ -162,7 +162,7 @@ def test_no_points_make_no_file(ball, tmp_path, monkeypatch):
 
 def test_other_programs_read_the_points(tmp_path, ball):
     points = ball[1][0]
-    (tmp_path / "points.ply").write_bytes(encode_ply(points))
+    (tmp_path / "points.ply").write_bytes(encode_points(points))
     vertices = PlyData.read(tmp_path / "points.ply")["vertex"]
     np.testing.assert_allclose(np.stack([vertices[axis] for axis in "xyz"], axis=-1), points.positions.numpy())
     colors = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=-1)

@@ -349,3 +349,91 @@ def test_poses_are_asked_of_a_file_that_is_not_there(tmp_path):
     write_photos(tmp_path / "photos")
     with pytest.raises(InputError, match=r"Neither poses_bounds.npy nor transforms.json"):
         prepare_scene(tmp_path / "photos", tmp_path / "scene", "file")
+
+
+def with_masks(folder, count=3, size=(WIDTH, HEIGHT)):
+    """Gives the first photos of a capture a mask that leaves their upper left quarter in, beside a depth map."""
+    (folder / "masks").mkdir()
+    inside = np.zeros(size[::-1], np.uint8)
+    inside[: size[1] // 2, : size[0] // 2] = 255
+    for index in range(count):
+        Image.fromarray(inside).save(folder / "masks" / f"{index}.png")
+
+    def change(content):
+        for index, frame in enumerate(content["frames"][:count]):
+            frame.update(mask_path=f"masks/{index}.png", depth_file_path="depth.png")
+
+    change_transforms(folder, change)
+
+
+def test_masks_come_along_at_the_size_of_their_photos(tmp_path, capsys):
+    names = write_photos(tmp_path / "photos")
+    write_transforms(tmp_path / "photos", names)
+    with_masks(tmp_path / "photos", count=2)
+    narrow = photo(ASIDE[2]).crop((0, 60, WIDTH, HEIGHT)).resize((WIDTH // 2, (HEIGHT - 60) // 2))
+    narrow.save(tmp_path / "photos" / names[2])  # so that the others are scaled by a half, and cropped
+    change_transforms(tmp_path / "photos", lambda content: content["frames"][2].update(w=WIDTH, h=HEIGHT - 60, cy=100))
+    prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    outputs = parse_nerfstudio(tmp_path / "scene")
+    masks = [np.asarray(Image.open(path)) for path in outputs.mask_filenames]
+    assert [path.stem for path in outputs.mask_filenames] == [path.stem for path in outputs.image_filenames]
+    height, width = (HEIGHT - 60) // 2, WIDTH // 2
+    assert all(mask.shape == (height, width) for mask in masks)
+    expected = np.zeros((height, width), np.uint8)
+    expected[: HEIGHT // 4 - 15, : width // 2] = 255  # 15 rows are cut off above, and 15 below
+    np.testing.assert_array_equal(masks[0], expected)
+    assert (masks[2] == 255).all()
+    printed = capsys.readouterr().out
+    assert f"Photos without a mask in {tmp_path / 'photos' / 'transforms.json'}, of which nothing is left" in printed
+    assert "Left out of the scene, as they are for photos of the former size: depth_file_path" in printed
+    assert all("depth_file_path" not in frame for frame in read_frames(tmp_path / "scene"))
+
+
+def read_frames(folder):
+    return json.loads((folder / "transforms.json").read_text())["frames"]
+
+
+def test_a_mask_is_turned_with_its_photo(tmp_path):
+    names = write_photos(tmp_path / "photos")
+    write_transforms(tmp_path / "photos", names)
+    for name in names:  # as stored they lie on their side, and the poses are for them upright
+        path = tmp_path / "photos" / name
+        save_with_orientation(Image.open(path).transpose(Image.Transpose.ROTATE_90), path, 6)
+    with_masks(tmp_path / "photos", size=(HEIGHT, WIDTH))
+    prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    mask = np.asarray(Image.open(tmp_path / "scene" / "masks" / "photo_000.png"))
+    expected = np.zeros((HEIGHT, WIDTH), np.uint8)
+    expected[: HEIGHT // 2, WIDTH // 2 :] = 255  # a quarter turn to the right
+    np.testing.assert_array_equal(mask, expected)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (lambda folder: (folder / "masks" / "1.png").unlink(), r"masks/1\.png doesn't fit .*isn't there: replace it"),
+        (
+            lambda folder: Image.new("L", (9, 9), 255).save(folder / "masks" / "1.png"),
+            "it is 9x9 pixels, and the photo",
+        ),
+        (lambda folder: Image.new("L", (WIDTH, HEIGHT)).save(folder / "masks" / "1.png"), "leaves nothing of .* in:"),
+        (
+            lambda folder: change_transforms(folder, lambda content: content["frames"][1].update(mask_path=None)),
+            r"Frame 1 \(from 0\) of .* has a mask_path that is no name: correct it or drop it",
+        ),
+    ],
+)
+def test_a_mask_that_cant_come_along_is_named(tmp_path, spoil, sentence):
+    write_transforms(tmp_path / "photos", write_photos(tmp_path / "photos"))
+    with_masks(tmp_path / "photos")
+    spoil(tmp_path / "photos")
+    with pytest.raises(InputError, match=sentence):
+        prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+
+
+def test_masks_whose_photos_nothing_names_are_said_to_have_no_use(tmp_path, capsys):
+    write_photos(tmp_path / "photos")
+    write_poses_bounds(tmp_path / "photos")
+    (tmp_path / "photos" / "masks").mkdir()
+    prepare_scene(tmp_path / "photos", tmp_path / "scene")
+    assert f"Not used: {tmp_path / 'photos' / 'masks'}; a photo's mask is what" in capsys.readouterr().out

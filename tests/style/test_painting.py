@@ -299,3 +299,24 @@ def test_a_painting_keeps_its_file_and_its_name_and_makes_a_small_jpeg(tmp_path,
     with Image.open(io.BytesIO(read.thumbnail())) as small:
         assert small.format == "JPEG" and max(small.size) == THUMBNAIL_SIDE
     assert Painting.received("", path.read_bytes()).name == "upload"
+
+
+def test_a_painting_that_is_transparent_all_over_is_refused_and_in_places_named(tmp_path, capsys):
+    pixels = np.full((16, 16, 4), 255, np.uint8)
+    pixels[:8, :, 3] = 0
+    Image.fromarray(pixels).save(tmp_path / "half.png")
+    Painting.read(tmp_path / "half.png")
+    assert "half.png is transparent in places, and laid over white." in " ".join(capsys.readouterr().out.split())
+    pixels[..., 3] = 0
+    Image.fromarray(pixels).save(tmp_path / "clear.png")
+    with pytest.raises(InputError, match=r"clear\.png is transparent all over: give one that shows something"):
+        Painting.read(tmp_path / "clear.png")
+
+
+@pytest.mark.parametrize("name", ["moving.gif", "moving.webp", "pages.tif"])
+def test_of_several_frames_the_first_is_the_painting_and_that_is_said(tmp_path, capsys, name):
+    first, second = (Image.new("RGB", (16, 16), color) for color in ("red", "blue"))
+    first.save(tmp_path / name, save_all=True, append_images=[second])
+    red = Painting.read(tmp_path / name).pixels[:, 8, 8]
+    assert red[0] > 0.9 and red[2] < 0.1
+    assert f"{name} has 2 frames; its first is the painting." in " ".join(capsys.readouterr().out.split())
