@@ -18,9 +18,9 @@ from sparsestyle_ns.export.splat_file import encode_splats
 
 pytestmark = pytest.mark.slow
 
-LIKE_OURS = 31.0
-"""In dB. PlayCanvas keeps numbers in 16 bits, blends in 8, and sorts so few splats into a thousand depths; of whole
-scenes, with 100,000, the two differ by 0.2 dB in their distance from the exact render."""
+LIKE_OURS = 45.0
+"""In dB; 51.6 to 53.1 were measured. PlayCanvas keeps numbers in 16 bits, blends in 8, and sorts by a thousand depths.
+In the order of another camera the first view here has 18.5."""
 
 VALIDATE = """
 const fs = require("fs");
@@ -58,7 +58,7 @@ def test_playcanvas_shows_a_file_as_the_command_says(form, splats, viewers, tmp_
             background = small.model.background
             own = picture_of_gaussians(gaussians, view.camera, background, DRAWINGS["PlayCanvas"]).clamp(0.0, 1.0)
             assert psnr(shown, own) > LIKE_OURS
-            assert psnr(shown, view.picture) > min(psnr(own, view.picture), LIKE_OURS) - 1.0
+            assert psnr(shown, view.picture) > psnr(own, view.picture) - 1.0
 
 
 def errors_of(glb, folder):
@@ -100,8 +100,4 @@ def test_playcanvas_shows_splats_as_gltf_turned_upright(splats, viewers, tmp_pat
         camera = camera[:]
         camera.camera_to_worlds = turn @ camera.camera_to_worlds
     with open_playcanvas(viewers, tmp_path / "profile", "splats.glb") as viewer:
-        # It sorts when it comes to it, as the camera moves: a few looks, of which one shows all in order.
-        aside = camera[:]
-        aside.camera_to_worlds = camera.camera_to_worlds + torch.tensor([0.0, 0.0, 0.0, 0.1])
-        looks = ((viewer.picture(aside, background), viewer.picture(camera, background)) for _ in range(5))
-        assert any(psnr(look, own) > LIKE_OURS for _, look in looks)
+        assert psnr(viewer.picture(camera, background), own) > LIKE_OURS
