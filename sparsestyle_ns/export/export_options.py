@@ -22,8 +22,8 @@ class ExportOptions(CommandOptions):
     html is a page that shows the scene in any browser with WebGL2, without server or network: a camera to move, a
     flight, strength, geometry, before and after, and of two runs the styles between them. It has at most 30 MB; if it
     would be larger, the scene gets fewer cells. splat is a PLY file of 3D Gaussians, for viewers and editors of splats;
-    glb has the same as glTF, and with --mesh a mesh beside them; spz is a tenth of the size. ply is a cloud of coloured
-    points. mesh is a PLY mesh with coloured vertices, made by Open3D's Poisson reconstruction.
+    glb has the same as glTF, and with --mesh a mesh beside them; spz has 20 bytes a splat or less. ply is a cloud of
+    coloured points. mesh is a PLY mesh with coloured vertices, made by Open3D's Poisson reconstruction.
     """
 
     runs: Annotated[Tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN]")]
