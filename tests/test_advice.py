@@ -307,6 +307,14 @@ def without_open3d(place: SimpleNamespace) -> None:
         typed("sparsestyle export {style} --output-path a.ply --format mesh", place)
 
 
+def without_gsply(place: SimpleNamespace) -> None:
+    import importlib.util
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importlib.util, "find_spec", lambda name: None)
+        typed("sparsestyle export {style} --output-path a.spz --format spz", place)
+
+
 def gallery_with_a_film(place: SimpleNamespace) -> None:
     Path("film.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42 the rest of a film")
     typed("sparsestyle gallery {style} --num-views 1 --video film.mp4", place)
@@ -703,6 +711,11 @@ TABLE = [
         " shows no scene; give 1000 or more",
         "sparsestyle export {style} --format splat --max-splats 10 --output-path a.ply",
         None,
+    ),
+    Advice(
+        "--format spz needs a package more: pip install gsply, or take --format splat --sh0",
+        without_gsply,
+        "sparsestyle export {style} --format splat --sh0 --output-path a.ply",
     ),
     Advice(
         "--format … takes ", None, "sparsestyle export {style} --format ply --output-path a.ply"

@@ -15,17 +15,18 @@ def export_run(options: ExportOptions) -> None:
     Raises an `InputError` if a run has no checkpoint, two can't be blended, the scene can't be written so, or Open3D
     can't be loaded.
     """
-    as_mesh = options.format == "mesh" or options.mesh
-    if as_mesh:  # found out before the minutes of rendering; other formats work without Open3D
-        from sparsestyle_ns.export.mesh import export_mesh
-    scenes, glb = load_scenes(list(map(find_config, options.runs))), options.format == "glb"
+    if options.format == "mesh" or options.mesh:  # found out before the minutes of rendering; others need no Open3D
+        from sparsestyle_ns.export.mesh import colored_mesh, export_mesh, make_mesh
+    scenes = load_scenes(list(map(find_config, options.runs)))
     scene = scenes[0]
     if options.format == "html":
         export_page(scenes, options.output_path, options.resolution)
     elif options.format == "ply":
         export_points(scene, options.output_path)
-    elif as_mesh:
-        export_mesh(scene, options.output_path, glb)
+    elif options.format == "mesh":
+        export_mesh(scene, options.output_path)
     else:
-        export_splats(scene, options.output_path, options.max_splats, options.sh0, glb)
+        form = "sh0" if options.sh0 and options.format == "splat" else options.format
+        mesh = colored_mesh(make_mesh(scene)) if options.mesh else None
+        export_splats(scene, options.output_path, form, options.max_splats, mesh)
     finish(options.output_path.resolve(), after_export(options.runs[0], options.output_path, options.format))

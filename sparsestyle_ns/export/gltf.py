@@ -7,7 +7,7 @@ shows coloured points. glTF's worlds stand with y up: where nerfstudio's have z 
 import json
 import math
 import struct
-from typing import Dict, List, NamedTuple, Union
+from typing import Dict, List, NamedTuple, Sequence, Union
 
 import numpy as np
 import torch
@@ -19,8 +19,8 @@ from sparsestyle_ns.export.gaussians import Gaussians
 from sparsestyle_ns.export.splat_file import coefficients
 
 SPLATTING, UNLIT = "KHR_gaussian_splatting", "KHR_materials_unlit"
-GLB_FLOATS = 15
-"""Numbers of four bytes that a Gaussian takes in a file."""
+GLTF_SPLAT_BYTES, VERTEX_BYTES, TRIANGLE_BYTES = 60, 36, 12
+"""What a Gaussian takes in a file, and a mesh."""
 GENERATOR = "sparsestyle_ns"
 POINTS, TRIANGLES = 0, 4
 FLOAT, UNSIGNED_BYTE, UNSIGNED_INT = 5126, 5121, 5125
@@ -37,15 +37,21 @@ class ColoredMesh(NamedTuple):
     colors: Float[np.ndarray, "vertices 3"]
     triangles: Int[np.ndarray, "triangles 3"]
 
+    @property
+    def bytes_in_gltf(self) -> int:
+        """What it takes in a file."""
+        return VERTEX_BYTES * len(self.positions) + TRIANGLE_BYTES * len(self.triangles)
 
-def encode_gltf(content: Union[Gaussians, ColoredMesh], space: Space) -> bytes:
-    """A .glb file of Gaussians or of a mesh, in a space's world."""
+
+def encode_gltf(contents: Sequence[Union[Gaussians, ColoredMesh]], space: Space) -> bytes:
+    """A .glb file of Gaussians, of a mesh, or of both as two nodes of one scene, in a space's world."""
     writer = _Writer()
     turn = {} if isinstance(space, ForwardFacingSpace) else {"rotation": list(Z_UP)}
-    if isinstance(content, Gaussians):
-        writer.add("Splats", writer.splats(content), turn)
-    else:
-        writer.add("Mesh", writer.mesh(content), turn)
+    for content in contents:
+        if isinstance(content, Gaussians):
+            writer.add("Splats", writer.splats(content), turn)
+        else:
+            writer.add("Mesh", writer.mesh(content), turn)
     return writer.encoded()
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sparsestyle_ns.export.gltf import ColoredMesh, encode_gltf
+from sparsestyle_ns.export.gltf import ColoredMesh
 from sparsestyle_ns.export.points import Points, joined, likeness, print_likeness, surfaces
 from sparsestyle_ns.export.stylised_scene import StylisedScene
 from sparsestyle_ns.utils.errors import InputError
@@ -38,18 +38,21 @@ FAR = 4.0
 reconstruction closes holes with them."""
 
 
-def export_mesh(scene: StylisedScene, output_path: Path, glb: bool = False) -> None:
-    """Writes a mesh with coloured vertices as PLY, or as glTF, and prints how well it shows each training view."""
+def export_mesh(scene: StylisedScene, output_path: Path) -> None:
+    """Writes a mesh with coloured vertices as PLY, and prints how well it shows each training view."""
+    mesh = make_mesh(scene)
+    write_output(output_path, encode_mesh(colored_mesh(mesh)), "The mesh", "scene.ply")
+
+
+def make_mesh(scene: StylisedScene) -> open3d.geometry.TriangleMesh:
+    """A mesh of the surfaces that a scene's training views see; prints how well it shows each of them."""
     pictures, parts = surfaces(scene)
     mesh = poisson_mesh(joined(parts))
-    colored = colored_mesh(mesh)
-    content = encode_gltf(colored, scene.model.space) if glb else encode_mesh(colored)
-    write_output(output_path, content, "The mesh", "scene.glb" if glb else "scene.ply")
-    frame = "glTF's coordinates, y up" if glb else "nerfstudio's coordinates"
-    print(f"{len(mesh.vertices):,} vertices, {len(mesh.triangles):,} triangles, in {frame}")
+    print(f"{len(mesh.vertices):,} vertices, {len(mesh.triangles):,} triangles")
     print("The mesh without light against the exact render:")
     shown = [picture_of_mesh(mesh, scene.cameras[index : index + 1]) for index in range(len(pictures))]
     print_likeness(scene.names, [likeness(*seen, picture) for seen, picture in zip(shown, pictures, strict=True)])
+    return mesh
 
 
 def poisson_mesh(points: Points) -> open3d.geometry.TriangleMesh:

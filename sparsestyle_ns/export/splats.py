@@ -5,7 +5,7 @@ fitted to exact pictures: of the photos' cameras, and of those that one may fly 
 """
 
 from pathlib import Path
-from typing import List, Optional, Tuple
+from typing import List, Literal, Optional, Tuple
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -14,9 +14,10 @@ from sparsestyle_ns.core.camera_paths import most_central, unseen_places
 from sparsestyle_ns.core.spaces import ForwardFacingSpace
 from sparsestyle_ns.data.view_selection import evenly_spaced
 from sparsestyle_ns.evaluation.held_out import exact_outputs
+from sparsestyle_ns.export.export_options import EXAMPLES
 from sparsestyle_ns.export.fit_gaussians import fit_gaussians
 from sparsestyle_ns.export.gaussians import DRAWINGS, Gaussians, picture_of_gaussians
-from sparsestyle_ns.export.gltf import GLB_FLOATS, encode_gltf
+from sparsestyle_ns.export.gltf import GLTF_SPLAT_BYTES, ColoredMesh, encode_gltf
 from sparsestyle_ns.export.orbit import SURVEY_SIDE, make_orbit, pinholes, turned
 from sparsestyle_ns.export.place_gaussians import look_at, place_gaussians
 from sparsestyle_ns.export.splat_file import FULL_FLOATS, SMALL_FLOATS, encode_splats
@@ -35,26 +36,44 @@ TOWARDS_EDGE = 0.7
 """Others there are turned by this share of how far one may turn."""
 YAWS, PITCHES = 8, 6
 """Views around any other scene that the fit sees, at so many heights."""
-MOST_SPLATS = 400_000
+SplatForm = Literal["splat", "sh0", "glb", "spz"]
+SPLAT_BYTES = {"splat": 4 * FULL_FLOATS, "sh0": 4 * SMALL_FLOATS, "glb": GLTF_SPLAT_BYTES, "spz": 20}
+"""What a splat takes in a file, at most."""
+LEAST_SPLATS, MOST_SPLATS = 1000, 400_000
 MOST_COMPARED = 6
 """Held-out views on which splats are compared, at most."""
 
 
-def most_splats(asked: Optional[int], floats: int) -> int:
-    """How many splats a file may have: as many as are asked for, else at most `MOST_SPLATS` in `MAX_BYTES`."""
-    return min(MOST_SPLATS, (MAX_BYTES - 2000) // (4 * floats)) if asked is None else asked
+def most_splats(asked: Optional[int], splat_bytes: int, taken: int = 0) -> int:
+    """How many splats a file may have: as many as are asked for, else at most `MOST_SPLATS` in `MAX_BYTES`.
 
-
-def export_splats(scene: StylisedScene, output_path: Path, asked: Optional[int], small: bool, glb: bool) -> None:
-    """Writes a scene's Gaussians as PLY, or as glTF, and prints their number and error; `InputError` if none are seen.
-
-    A `small` PLY leaves out what is 0 in every one of them.
+    `taken` is what the file holds besides.
     """
-    floats = GLB_FLOATS if glb else SMALL_FLOATS if small else FULL_FLOATS
-    gaussians = make_splats(scene, most_splats(asked, floats))
-    content = encode_gltf(gaussians, scene.model.space) if glb else encode_splats(gaussians, small)
-    write_output(output_path, content, "The splats", "scene.glb" if glb else "scene.ply")
-    frame = "glTF's coordinates, y up" if glb else "nerfstudio's coordinates"
+    if asked is not None:
+        return asked
+    return max(LEAST_SPLATS, min(MOST_SPLATS, (MAX_BYTES - 2000 - taken) // splat_bytes))
+
+
+def export_splats(
+    scene: StylisedScene, output_path: Path, form: SplatForm, asked: Optional[int], mesh: Optional[ColoredMesh] = None
+) -> None:
+    """Writes a scene's Gaussians, and prints their number and error; `InputError` if none are seen.
+
+    A file of the form glb may have a mesh besides.
+    """
+    space, more = scene.model.space, [] if mesh is None else [mesh]
+    gaussians = make_splats(scene, most_splats(asked, SPLAT_BYTES[form], sum(each.bytes_in_gltf for each in more)))
+    frame = "nerfstudio's coordinates" if form in ("splat", "sh0") else "glTF's coordinates, y up"
+    if form == "glb":
+        content = encode_gltf([gaussians, *more], space)
+    elif form == "spz":  # it rounds: what is compared is what it holds
+        from sparsestyle_ns.export.spz_file import decode_spz, encode_spz
+
+        content = encode_spz(gaussians, space)
+        gaussians = decode_spz(content, space)
+    else:
+        content = encode_splats(gaussians, form == "sh0")
+    write_output(output_path, content, "The splats", EXAMPLES.get(form, "scene.ply"))
     print(f"{len(gaussians):,} splats, {len(content) / 1e6:.1f} MB, in {frame}")
     print_likeness_of_splats(scene, gaussians)
 

@@ -30,6 +30,8 @@ EMPTY = 1
 """Code of density 0, as in baked rendering, where 0 stands for a value that isn't known."""
 ROUNDING = 0.05
 """Error of a graphics card's interpolation, in steps of a code: what is less than this above `EMPTY` is empty."""
+LEAST_CODE = 33
+"""Cells all of whose voxels have a smaller code of density count as empty: a 128th of a ray is hardly dimmed there."""
 CELLS_PER_CALL = 1 << 16
 STYLE_CODES, COARSE_CODES = (1, 2, 3, 4), (0, 5, 6, 7)
 """Of the eight codes of a baked volume (`Shade`), those of a stylised field and of the coarse one."""
@@ -69,7 +71,7 @@ class VoxelGrid:
     """Voxels of one or two styles, which know the same places, and of the coarse field that they have in common.
 
     Attributes:
-        occupied: cells of a grid of its own in which samples count.
+        occupied: cells of a grid of its own in which samples count (`visible_cells`).
     """
 
     styles: List[Voxels]
@@ -113,12 +115,20 @@ def bake_voxels(models: Sequence[HierStyleModel], resolution: int, cameras: Sequ
     cells = seen & (occupied | last_step_cells(model, resolution))
     half = -(-resolution // 2)
     fewer_cells = F.adaptive_max_pool3d(cells.float()[None], half)[0] > 0
-    styles = [volume, *(other.bake(resolution) for other in models[1:])]
-    return VoxelGrid(
-        [fill_voxels(each, cells, STYLE_CODES) for each in styles],
-        fill_voxels(model.bake(half), fewer_cells, COARSE_CODES),
-        filled.cpu(),
-    )
+    volumes = [volume, *(other.bake(resolution) for other in models[1:])]
+    styles = [fill_voxels(each, cells, STYLE_CODES) for each in volumes]
+    coarse = fill_voxels(model.bake(half), fewer_cells, COARSE_CODES)
+    return VoxelGrid(styles, coarse, visible_cells([*styles, coarse], filled.cpu()))
+
+
+def visible_cells(fields: Sequence[Voxels], filled: Bool[Tensor, "u v w"]) -> Bool[Tensor, "u v w"]:
+    """Of filled cells those in which one of the fields has more than next to nothing between its voxels."""
+    visible = torch.zeros_like(filled)
+    for voxels in fields:
+        dense = (voxels.codes[None, ..., 0] >= LEAST_CODE).float()
+        between = F.max_pool3d(dense, kernel_size=2, stride=1)
+        visible |= F.adaptive_max_pool3d(between, len(filled))[0] > 0
+    return visible & filled
 
 
 def fill_voxels(volume: BakedVolume, cells: Bool[Tensor, "x y z"], chosen: Sequence[int]) -> Voxels:

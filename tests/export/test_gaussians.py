@@ -1,5 +1,7 @@
 """Gaussians are drawn, and learn, as the obvious loop over them says; files of them are what other programs read."""
 
+import gzip
+import importlib.util
 import io
 import json
 import math
@@ -17,12 +19,14 @@ from sparsestyle_ns.cli import main
 from sparsestyle_ns.export import splats
 from sparsestyle_ns.export.fit_gaussians import LEAST_SIZE, fit_gaussians, least_log_scales
 from sparsestyle_ns.export.gaussians import DRAWINGS, Gaussians, picture_of_gaussians
-from sparsestyle_ns.export.gltf import ColoredMesh, encode_gltf
+from sparsestyle_ns.export.gltf import GLTF_SPLAT_BYTES, ColoredMesh, encode_gltf
 from sparsestyle_ns.export.place_gaussians import SeenView, jacobians, place_gaussians, quaternions
 from sparsestyle_ns.export.splat_file import CONSTANT_HARMONIC, encode_splats
 from sparsestyle_ns.export.splat_kernels import MAX_ALPHA, MIN_ALPHA, REACH
 from sparsestyle_ns.export.splats import most_splats
 from sparsestyle_ns.export.voxel_grid import ray_segments
+
+needs_gsply = pytest.mark.skipif(importlib.util.find_spec("gsply") is None, reason="gsply isn't installed")
 
 NUMBER = 40
 BACKGROUND = torch.tensor([1.0, 0.5, 0.2])
@@ -195,12 +199,13 @@ def test_a_file_of_splats_has_the_reference_s_fields_in_their_order(small):
 def test_without_a_wish_as_many_splats_are_written_as_fit_into_30_megabytes():
     rows = random_gaussians()
     for floats, small in ((62, False), (17, True)):
-        most = most_splats(None, floats)
+        most = most_splats(None, 4 * floats)
         header = len(encode_splats(Gaussians(rows), small)) - 4 * floats * NUMBER
         assert most <= 400_000
         assert header + 4 * floats * most <= 30_000_000
-    assert most_splats(None, 17) == 400_000
-    assert most_splats(500_000, 62) == 500_000
+    assert most_splats(None, 68) == 400_000
+    assert most_splats(500_000, 248) == 500_000
+    assert most_splats(None, 60, taken=12_000_000) == (18_000_000 - 2000) // 60
 
 
 def parts_of(glb):
@@ -225,7 +230,7 @@ def numbers_of(told, data, index):
 
 def test_gaussians_as_gltf_are_points_that_the_extension_describes():
     rows = random_gaussians()
-    told, data = parts_of(encode_gltf(Gaussians(rows), scene("box").model.space))
+    told, data = parts_of(encode_gltf([Gaussians(rows)], scene("box").model.space))
     assert told["extensionsUsed"] == ["KHR_gaussian_splatting"]
     assert told["nodes"][0]["rotation"] == pytest.approx([-(0.5**0.5), 0, 0, 0.5**0.5])  # z up becomes y up
     (primitive,) = told["meshes"][0]["primitives"]
@@ -245,7 +250,7 @@ def test_gaussians_as_gltf_are_points_that_the_extension_describes():
 def test_a_mesh_as_gltf_has_linear_colours_and_needs_no_light():
     corners = np.eye(3)
     mesh = ColoredMesh(corners, corners, np.array([[0.0, 0.5, 1.0]] * 3), np.array([[0, 1, 2]]))
-    told, data = parts_of(encode_gltf(mesh, scene("ndc").model.space))
+    told, data = parts_of(encode_gltf([mesh], scene("ndc").model.space))
     assert "rotation" not in told["nodes"][0]  # forward-facing worlds have y up already
     (primitive,) = told["meshes"][0]["primitives"]
     assert told["materials"][primitive["material"]]["extensions"] == {"KHR_materials_unlit": {}}
@@ -254,7 +259,41 @@ def test_a_mesh_as_gltf_has_linear_colours_and_needs_no_light():
     torch.testing.assert_close(color, torch.tensor([0.0, 0.2140, 1.0]), atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("form", ["splat", "glb"])
+def test_splats_and_a_mesh_are_two_nodes_of_one_file_that_takes_what_is_said():
+    corners = np.eye(3)
+    mesh = ColoredMesh(corners, corners, corners, np.array([[0, 1, 2]]))
+    told, data = parts_of(encode_gltf([Gaussians(random_gaussians()), mesh], scene("box").model.space))
+    assert told["scenes"][0]["nodes"] == [0, 1]
+    assert [(node["name"], node["mesh"]) for node in told["nodes"]] == [("Splats", 0), ("Mesh", 1)]
+    assert told["nodes"][0]["rotation"] == told["nodes"][1]["rotation"]
+    assert [mesh["primitives"][0]["mode"] for mesh in told["meshes"]] == [0, 4]
+    assert len(data) == GLTF_SPLAT_BYTES * NUMBER + mesh.bytes_in_gltf
+
+
+@needs_gsply
+@pytest.mark.parametrize("kind", ["ndc", "box"])
+def test_gaussians_as_spz_are_rounded_and_stand_with_y_up(kind):
+    from sparsestyle_ns.export.spz_file import decode_spz, encode_spz
+
+    rows, space = random_gaussians(), scene(kind).model.space
+    content = encode_spz(Gaussians(rows), space)
+    plain = gzip.decompress(content)
+    magic, version, number, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", plain)
+    assert (magic, version, number, degree, flags) == (b"NGSP", 3, NUMBER, 0, 0)
+    assert len(plain) == 16 + 20 * NUMBER
+    first = np.frombuffer(plain[16:25], np.uint8).reshape(3, 3).astype(np.int64) @ [1, 1 << 8, 1 << 16]
+    x, y, z = np.where(first >= 1 << 23, first - (1 << 24), first) / 2.0**bits
+    expected = rows[0, :3].tolist()
+    assert ([x, y, z] if kind == "ndc" else [x, -z, y]) == pytest.approx(expected, abs=1e-5)
+    read = decode_spz(content, space).rows
+    assert float((read[:, :3] - rows[:, :3]).abs().max()) < 2e-6
+    assert float((read[:, 3:6] - rows[:, 3:6]).abs().max()) < 0.5 / 16 + 1e-5
+    torch.testing.assert_close(rotations(read[:, 6:10]), rotations(rows[:, 6:10]), atol=0.01, rtol=0)
+    torch.testing.assert_close(read[:, 10].sigmoid(), rows[:, 10].sigmoid(), atol=0.51 / 255, rtol=0)
+    torch.testing.assert_close(read[:, 11:], rows[:, 11:], atol=0.004, rtol=0)
+
+
+@pytest.mark.parametrize("form", ["splat", "glb", pytest.param("spz", marks=needs_gsply)])
 def test_the_command_writes_splats_and_says_how_far_they_are_from_the_exact_render(
     form, patterned_run, tmp_path, capsys, monkeypatch
 ):
@@ -267,7 +306,9 @@ def test_the_command_writes_splats_and_says_how_far_they_are_from_the_exact_rend
     assert 100 < number <= 1500
     if form == "splat":
         assert PlyData.read(str(path))["vertex"].count == number
-    else:
+    elif form == "glb":
         assert parts_of(path.read_bytes())[0]["accessors"][0]["count"] == number
+    else:
+        assert struct.unpack_from("<I", gzip.decompress(path.read_bytes()), 8) == (number,)
     assert re.search(r"PSNR to the exact render, held-out view of \S+: [\d.]+ dB", printed)
     assert re.search(r"Mean of the held-out views at 32 × 24, drawn as .+: [\d.]+ dB \(as ", printed)

@@ -22,6 +22,13 @@ LIKE_OURS = 45.0
 """In dB; 51.6 to 53.1 were measured. PlayCanvas keeps numbers in 16 bits, blends in 8, and sorts by a thousand depths.
 In the order of another camera the first view here has 18.5."""
 
+
+def triangle() -> ColoredMesh:
+    """A mesh of one grey triangle."""
+    corners = np.eye(3)
+    return ColoredMesh(corners, corners, np.full((3, 3), 0.5), np.array([[0, 1, 2]]))
+
+
 VALIDATE = """
 const fs = require("fs");
 require("gltf-validator").validateBytes(new Uint8Array(fs.readFileSync(process.argv[2])))
@@ -73,7 +80,7 @@ def errors_of(glb, folder):
 @needs_viewers
 def test_khronos_validator_finds_no_error_in_splats_as_gltf_but_names_that_it_does_not_know(splats, viewers):
     small, _, gaussians = splats
-    errors = errors_of(encode_gltf(gaussians, small.model.space), viewers)
+    errors = errors_of(encode_gltf([gaussians], small.model.space), viewers)
     # This version knows no attributes of extensions; their names are as KHR_gaussian_splatting has them.
     prefix = "/meshes/0/primitives/0/attributes/KHR_gaussian_splatting:"
     names = ("OPACITY", "ROTATION", "SCALE", "SH_DEGREE_0_COEF_0")
@@ -83,15 +90,20 @@ def test_khronos_validator_finds_no_error_in_splats_as_gltf_but_names_that_it_do
 
 @needs_viewers
 def test_khronos_validator_finds_no_error_in_a_mesh_as_gltf(viewers):
-    corners = np.eye(3)
-    mesh = ColoredMesh(corners, corners, np.full((3, 3), 0.5), np.array([[0, 1, 2]]))
-    assert errors_of(encode_gltf(mesh, scene("box").model.space), viewers) == []
+    assert errors_of(encode_gltf([triangle()], scene("box").model.space), viewers) == []
+
+
+@needs_viewers
+def test_a_mesh_beside_splats_brings_no_error_more(splats, viewers):
+    small, _, gaussians = splats
+    both = errors_of(encode_gltf([gaussians, triangle()], small.model.space), viewers)
+    assert both == errors_of(encode_gltf([gaussians], small.model.space), viewers)
 
 
 @needs_viewers
 def test_playcanvas_shows_splats_as_gltf_turned_upright(splats, viewers, tmp_path):
     small, views, gaussians = splats
-    (viewers / "splats.glb").write_bytes(encode_gltf(gaussians, small.model.space))
+    (viewers / "splats.glb").write_bytes(encode_gltf([gaussians], small.model.space))
     background = small.model.background
     camera = views[0].camera
     own = picture_of_gaussians(gaussians, camera, background, DRAWINGS["PlayCanvas"]).clamp(0.0, 1.0)

@@ -11,7 +11,15 @@ from sparsestyle_ns.core.occupancy import Occupancy
 from sparsestyle_ns.evaluation.held_out import exact_outputs
 from sparsestyle_ns.export.orbit import make_orbit, pinholes, survey, turned
 from sparsestyle_ns.export.stylised_scene import load_scene
-from sparsestyle_ns.export.voxel_grid import Voxels, bake_voxels, last_step_cells, picture_of_voxels, render_voxels
+from sparsestyle_ns.export.voxel_grid import (
+    LEAST_CODE,
+    Voxels,
+    bake_voxels,
+    last_step_cells,
+    picture_of_voxels,
+    render_voxels,
+    visible_cells,
+)
 from sparsestyle_ns.export.web_page import median_depth
 from sparsestyle_ns.rendering.baked import DENSITY_STEP, DENSITY_UNIT
 from sparsestyle_ns.rendering.mixing import Mix
@@ -139,3 +147,17 @@ def test_a_run_whose_config_asks_for_less_of_the_style_is_exported_so(exported, 
     loaded.model.display.own = before
     assert psnr(picture_of_voxels(voxels, loaded.model, camera, mix), exact) > 33
     assert psnr(exact, exact_outputs(loaded.model, camera)["rgb"]) < 30
+
+
+def test_cells_are_visible_where_a_dense_voxel_reaches_into_them_and_nowhere_else():
+    codes = torch.full((32, 32, 32, 4), LEAST_CODE - 1, dtype=torch.uint8)
+    codes[9, 20, 31, 0] = LEAST_CODE
+    voxels, filled = Voxels(codes, codes[..., 0] > 0), torch.ones(12, 12, 12, dtype=torch.bool)
+    visible = visible_cells([voxels], filled)
+    points = 2.0 * torch.rand(200_000, 3, generator=torch.Generator().manual_seed(0)) - 1.0
+    dense = points[voxels.interpolate(points)[:, 0] > LEAST_CODE - 1 + 1e-3]
+    reached = torch.zeros_like(filled)
+    reached[tuple(((0.5 * dense + 0.5) * 12).long().unbind(-1))] = True
+    assert torch.equal(visible, reached)
+    filled[2:4] = False
+    assert not visible_cells([voxels], filled)[2:4].any()

@@ -19,7 +19,6 @@ from torch.amp import GradScaler
 from sparsestyle_ns.core.occupancy import DensityGrid
 from sparsestyle_ns.engine.muon import Muon
 from sparsestyle_ns.engine.trainer import SparseStyleTrainer
-from sparsestyle_ns.engine.muon import Muon
 from sparsestyle_ns.engine.training import FusedAdamConfig, MuonConfig
 from sparsestyle_ns.pipelines.coarse_fewshot import CoarseFewShotPipeline
 from sparsestyle_ns.pipelines.hier_style import HierStylePipeline

@@ -6,7 +6,13 @@ precision highp float;
 precision highp int;
 precision highp sampler3D;
 
-const int NDC = 0, BOX = 1, CONTRACTED = 2;
+#define NDC 0
+#define BOX 1
+#define CONTRACTED 2
+// renderer.js defines SPACE, UNBOUNDED, STYLES (how many are seen) and HAS_COARSE, because a processor that stands in for
+// a graphics card goes through both sides of every `if`.
+
+const float ENOUGH = 0.02;  // light behind which a ray ends; what is left of it gets the last colour
 const float MAX_OPTICAL_DEPTH = 80.0;
 const float MIN_FORWARD = 1e-6;
 const float MAX_DISTANCE = 1e4;
@@ -15,8 +21,8 @@ uniform sampler3D u_style, u_other, u_coarse;  // rgb: colour, a: code of the de
 uniform sampler3D u_clearance;                 // how many cells away the nearest is that holds anything, of 255
 uniform float u_strength, u_density_share, u_blend;
 uniform float u_divider;                       // left of it, in pixels, is the coarse field
-uniform int u_space, u_num_steps;
-uniform bool u_unbounded;
+uniform int u_num_steps;
+uniform vec2 u_style_texels, u_coarse_texels;  // from shares of the cube's sides to a texture's: factor and offset
 uniform vec3 u_minimum, u_maximum;       // NDC, box: what becomes the cube
 uniform vec2 u_focal_over_half_size;     // NDC
 uniform vec2 u_depths;                   // NDC: t' of the nearest and of the farthest thing
@@ -32,7 +38,8 @@ out vec4 color;
 // A segment in field coordinates, start + s extent, or for a contracted space the ray in its unit.
 vec3 start, extent;
 
-bool enter_ndc(vec3 origin, vec3 direction) {
+#if SPACE == NDC
+bool enter(vec3 origin, vec3 direction) {
     if (direction.z >= -MIN_FORWARD) return false;
     vec2 slope = direction.xy / direction.z;
     vec2 crossing = origin.xy - (u_near + origin.z) * slope;
@@ -47,7 +54,8 @@ bool enter_ndc(vec3 origin, vec3 direction) {
     return true;
 }
 
-bool enter_box(vec3 origin, vec3 direction) {
+#elif SPACE == BOX
+bool enter(vec3 origin, vec3 direction) {
     vec3 safe = mix(direction, vec3(1e-30), lessThan(abs(direction), vec3(1e-30)));
     vec3 first = (u_minimum - origin) / safe, second = (u_maximum - origin) / safe;
     vec3 low = min(first, second), high = max(first, second);
@@ -60,26 +68,31 @@ bool enter_box(vec3 origin, vec3 direction) {
     return far > near;
 }
 
+#else
 bool enter(vec3 origin, vec3 direction) {
-    if (u_space == NDC) return enter_ndc(origin, direction);
-    if (u_space == BOX) return enter_box(origin, direction);
     start = origin / u_unit;
     extent = direction;
     return true;
 }
+#endif
 
+#if SPACE == CONTRACTED
 float spacing(float distance) {
     return distance < 1.0 ? 0.5 * distance : 1.0 - 0.5 / distance;
 }
 
 vec3 point(float s) {
-    if (u_space != CONTRACTED) return start + s * extent;
     float spaced = mix(spacing(u_near), spacing(MAX_DISTANCE), s);
     float distance = spaced < 0.5 ? 2.0 * spaced : 0.5 / max(1.0 - spaced, 0.5 / MAX_DISTANCE);
     vec3 position = start + distance * extent, size = abs(position);
     float norm = max(size.x, max(size.y, size.z));
     return position * (norm < 1.0 ? 0.5 : (1.0 - 0.5 / norm) / norm);
 }
+#else
+vec3 point(float s) {
+    return start + s * extent;
+}
+#endif
 
 float density_of(float code) {
     float steps = 255.0 * code - 1.0;
@@ -87,20 +100,29 @@ float density_of(float code) {
 }
 
 // Colour and density of a field, at a share of the cube's sides.
-vec4 field(sampler3D voxels, vec3 share) {
-    vec3 texels = vec3(textureSize(voxels, 0));
-    vec4 value = textureLod(voxels, (share * (texels - 1.0) + 0.5) / texels, 0.0);
+vec4 field(sampler3D voxels, vec2 texels, vec3 share) {
+    vec4 value = textureLod(voxels, share * texels.x + texels.y, 0.0);
     return vec4(value.rgb, density_of(value.a));
 }
 
 vec4 mixture(vec3 share, float strength, float density_share) {
-    vec4 value = vec4(0.0);
-    if (strength > 0.0) {
-        value = field(u_style, share);
-        if (u_blend > 0.0) value = mix(value, field(u_other, share), u_blend);
-    }
-    if (density_share == 1.0) return value;
-    return mix(field(u_coarse, share), value, vec4(vec3(strength), density_share));
+#if STYLES == 0
+    return field(u_coarse, u_coarse_texels, share);
+#else
+    vec4 value = field(u_style, u_style_texels, share);
+#if STYLES == 2
+    value = mix(value, field(u_other, u_style_texels, share), u_blend);
+#endif
+#if HAS_COARSE
+    value = mix(field(u_coarse, u_coarse_texels, share), value, vec4(vec3(strength), density_share));
+#endif
+    return value;
+#endif
+}
+
+// The middle of a step, as a share of the cube's sides in the textures' order.
+vec3 middle(int i, float step) {
+    return clamp(0.5 * point((float(i) + 0.5) * step) + 0.5, 0.0, 1.0).zyx;
 }
 
 void main() {
@@ -113,28 +135,34 @@ void main() {
     float light = 1.0;
     if (enter(u_pose[3].xyz, direction)) {
         float step = 1.0 / float(u_num_steps), length_ = length(extent) * step;
-        ivec3 cells = textureSize(u_clearance, 0);
+        vec3 cells = vec3(textureSize(u_clearance, 0));
         // Steps that surely lead out of no more than one cell; how a contraction bends them, nobody knows.
-        float steps_a_cell = u_space == CONTRACTED ? 0.0 : 1.998 / (float(cells.x) * length_ + 1e-6);
+        float steps_a_cell = SPACE == CONTRACTED ? 0.0 : 1.998 / (cells.x * length_ + 1e-6);
+        int end = UNBOUNDED ? u_num_steps - 1 : u_num_steps;  // the last step of an unbounded ray always counts
+        bool inside = false;
         for (int i = 0; i < u_num_steps; i++) {
-            bool last = u_unbounded && i == u_num_steps - 1;
-            vec3 share = clamp(0.5 * point((float(i) + 0.5) * step) + 0.5, 0.0, 1.0).zyx;
-            if (!last) {
-                ivec3 cell = min(ivec3(share * vec3(cells)), cells - 1);
-                float clear = 255.0 * texelFetch(u_clearance, cell, 0).r;
-                if (clear > 0.5) {
-                    i += int((floor(clear + 0.5) - 1.0) * steps_a_cell);
-                    if (u_unbounded) i = min(i, u_num_steps - 2);
-                    continue;
-                }
+            vec3 share = middle(i, step);
+            while (!inside && i < end) {
+                float clear = 255.0 * texelFetch(u_clearance, ivec3(min(share * cells, cells - 1.0)), 0).r;
+                if (clear < 0.5) break;
+                i = min(i + 1 + int((floor(clear + 0.5) - 1.0) * steps_a_cell), end);
+                share = middle(i, step);
             }
+            if (i == u_num_steps) break;
             vec4 value = mixture(share, strength, density_share);
-            if (value.a <= 0.0) continue;
-            if (u_space == CONTRACTED) length_ = distance(point(float(i) * step), point(float(i + 1) * step));
-            float left = exp(-(last ? MAX_OPTICAL_DEPTH : min(value.a * length_, MAX_OPTICAL_DEPTH)));
+            inside = value.a > 0.0;
+#if SPACE == CONTRACTED
+            length_ = distance(point(float(i) * step), point(float(i + 1) * step));
+#endif
+            float depth = UNBOUNDED && inside && i == end ? MAX_OPTICAL_DEPTH : value.a * length_;
+            float left = exp(-min(depth, MAX_OPTICAL_DEPTH));
             sum += light * (1.0 - left) * value.rgb;
             light *= left;
-            if (light < 1e-3) break;
+            if (light < ENOUGH) {
+                sum += light * value.rgb;
+                light = 0.0;
+                break;
+            }
         }
     }
     color = vec4(sum + light * u_background, 1.0);

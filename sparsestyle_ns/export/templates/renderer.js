@@ -8,12 +8,15 @@ function compile(gl, type, source) {
   return shader;
 }
 
-function makeProgram(gl) {
+/** A program of raymarch.frag for some of what it can do. */
+function makeProgram(gl, defined) {
+  const lines = Object.entries(defined).map(([name, value]) => `#define ${name} ${value}\n`);
+  const ray = document.getElementById("shader").textContent.trim().replace("\n", `\n${lines.join("")}`);
   const corners =
     "#version 300 es\nvoid main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }";
   const program = gl.createProgram();
   gl.attachShader(program, compile(gl, gl.VERTEX_SHADER, corners));
-  gl.attachShader(program, compile(gl, gl.FRAGMENT_SHADER, document.getElementById("shader").textContent.trim()));
+  gl.attachShader(program, compile(gl, gl.FRAGMENT_SHADER, ray));
   gl.linkProgram(program);
   if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
   return program;
@@ -32,8 +35,8 @@ function makeTexture(gl, unit, side, internal, format, filter, bytes) {
   if (gl.getError() !== gl.NO_ERROR) throw new Error("This device has too little graphics memory for the scene.");
 }
 
-/** Hands the voxels to the graphics card; in the shader the style, the other one, the coarse field and the clearance. */
-function makeTextures(gl, at, voxels) {
+/** Hands the voxels to the graphics card: the clearance, the coarse field, the style and the other one. */
+function makeTextures(gl, voxels) {
   const side = scene.styles[0].resolution + 1;
   if (side > gl.getParameter(gl.MAX_3D_TEXTURE_SIZE)) {
     throw new Error("This device's graphics can't hold the scene; export it with a smaller --resolution.");
@@ -41,17 +44,15 @@ function makeTextures(gl, at, voxels) {
   makeTexture(gl, 0, scene.cells, gl.R8, gl.RED, gl.NEAREST, voxels.clearance);
   makeTexture(gl, 1, scene.coarse.resolution + 1, gl.RGBA8, gl.RGBA, gl.LINEAR, voxels.coarse);
   voxels.styles.forEach((texels, i) => makeTexture(gl, 2 + i, side, gl.RGBA8, gl.RGBA, gl.LINEAR, texels));
-  gl.uniform1i(at("u_clearance"), 0);
-  gl.uniform1i(at("u_coarse"), 1);
-  gl.uniform1i(at("u_style"), 2);
-  gl.uniform1i(at("u_other"), 1 + voxels.styles.length);
 }
 
 /** Tells the shader what stays as it is. */
 function describeScene(gl, at) {
   const { space, density } = scene;
-  gl.uniform1i(at("u_space"), ["ndc", "box", "contracted"].indexOf(space.kind));
-  gl.uniform1i(at("u_unbounded"), space.unbounded);
+  ["u_clearance", "u_coarse", "u_style", "u_other"].forEach((name, unit) => gl.uniform1i(at(name), unit));
+  const toTexels = ({ resolution }) => [resolution / (resolution + 1), 0.5 / (resolution + 1)];
+  gl.uniform2fv(at("u_style_texels"), toTexels(scene.styles[0]));
+  gl.uniform2fv(at("u_coarse_texels"), toTexels(scene.coarse));
   gl.uniform3fv(at("u_minimum"), space.minimum);
   gl.uniform3fv(at("u_maximum"), space.maximum);
   gl.uniform2fv(at("u_focal_over_half_size"), space.focal_over_half_size);
@@ -64,19 +65,44 @@ function describeScene(gl, at) {
   gl.uniform3fv(at("u_background"), scene.background);
 }
 
+const CHANGING = ["u_num_steps", "u_pose", "u_focal", "u_center", "u_size", "u_strength", "u_density_share", "u_blend", "u_divider"];
+
+/** What raymarch.frag has to do for a look. */
+function neededFor({ strength, geometry, blend, divider }) {
+  const styles = strength === 0 ? 0 : blend === 0 ? 1 : 2;
+  const hasCoarse = divider !== null || strength * geometry < 1;
+  const { kind, unbounded } = scene.space;
+  return { SPACE: kind.toUpperCase(), UNBOUNDED: unbounded, STYLES: styles, HAS_COARSE: Number(hasCoarse) };
+}
+
+/** A function that chooses the program for a look, and returns the places of what changes. */
+function makeChooser(gl) {
+  const known = new Map();
+  return (look) => {
+    const defined = neededFor(look);
+    const key = JSON.stringify(defined);
+    if (known.has(key)) {
+      gl.useProgram(known.get(key).program);
+    } else {
+      const program = makeProgram(gl, defined);
+      gl.useProgram(program);
+      const at = (name) => gl.getUniformLocation(program, name);
+      describeScene(gl, at);
+      known.set(key, { program, places: Object.fromEntries(CHANGING.map((name) => [name, at(name)])) });
+    }
+    return known.get(key).places;
+  };
+}
+
 /** A function that draws what a camera sees, in a look, with a share of the steps, and returns the seconds it took. */
 function makeRenderer(gl, voxels) {
-  const program = makeProgram(gl);
-  gl.useProgram(program);
-  const at = (name) => gl.getUniformLocation(program, name);
-  makeTextures(gl, at, voxels);
-  describeScene(gl, at);
-  const changing = ["u_num_steps", "u_pose", "u_focal", "u_center", "u_size", "u_strength", "u_density_share", "u_blend", "u_divider"];
-  const places = Object.fromEntries(changing.map((name) => [name, at(name)]));
+  makeTextures(gl, voxels);
+  const choose = makeChooser(gl);
   const pixel = new Uint8Array(4);
   return ({ pose, camera }, look, steps, width, height) => {
     const start = performance.now();
-    [canvas.width, canvas.height] = [width, height];
+    const places = choose(look);
+    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
     gl.viewport(0, 0, width, height);
     const scale = Math.min(width / camera.width, height / camera.height); // the whole photo fits in
     gl.uniform2f(places.u_focal, scale * camera.fx, scale * camera.fy);
