@@ -65,8 +65,8 @@ coarse_fewshot = method(
     "Coarse radiance field from three to eight photos (stage 1): under four minutes on two CPU cores at 504 pixels.",
     _target=CoarseFewShotTrainer,
     method_name="coarse-fewshot",
-    max_num_iterations=3000,
-    steps_per_save=1000,
+    max_num_iterations=2500,
+    steps_per_save=500,
     steps_per_log=50,
     pipeline=CoarseFewShotPipelineConfig(
         datamanager=FewShotDataManagerConfig(train_num_rays_per_batch=256), panel=EffectsPanel
@@ -85,7 +85,7 @@ hier_style = method(
     "A coarse-fewshot scene in the style of a painting, --style-image FILE (stage 2); both under ten minutes there.",
     coarse_method=coarse_fewshot_config,
     method_name="hier-style",
-    max_num_iterations=400,
+    max_num_iterations=200,
     steps_per_save=100,
     steps_per_log=5,
     pipeline=HierStylePipelineConfig(datamanager=FewShotDataManagerConfig(), panel=StylePanel),
@@ -115,7 +115,9 @@ hier_style_draft = variant(
         **DRAFT,
         "coarse_method": coarse_fewshot_draft_config,
         "max_num_iterations": 80,
+        "pipeline.view_scales": (0.5, 1.0),
         "pipeline.scale_shares": (0.85, 0.15),
+        "pipeline.model.max_resolution": 256,
     },
 )
 
@@ -155,8 +157,6 @@ hier_style_paper = variant(
         "pipeline.object_style": 1.0,
         "pipeline.loss_weights": {**dict.fromkeys(LOSSES, 0.0), "content": 10.0, "style": 1.0},
         "pipeline.model.min_resolution": 128,
-        "pipeline.model.max_resolution": 512,
-        "pipeline.model.object_cells": 1.0,
         "pipeline.model.depth_cells": 1.0,
         "pipeline.warm_start_steps": 0,
         "pipeline.thinning": 0.0,

@@ -48,14 +48,14 @@ def test_stage_2_goes_from_126_to_252_pixels_whatever_the_photos_are(variant):
 
 
 def test_views_are_as_much_larger_as_strokes_are_finer_up_to_the_photos_size():
-    for stroke_size, side, seen in ((0.5, 504, 504), (0.7, 360, 360), (2.0, 252, 126)):
+    for stroke_size, side, seen in ((0.5, 1008, 1008), (0.7, 720, 720), (2.0, 504, 252)):
         config = replace(method_config("hier-style").pipeline, stroke_size=stroke_size)
         assert 1008 * config.share_of_photos(1.0, 1008) == pytest.approx(side)
         assert config.side_at(1.0, 1008) == seen
         assert config.share_of_photos(1.0, 200) == 1.0
 
 
-@pytest.mark.parametrize(("view_side", "side"), [("photos", 1008), (300, 300), ("auto", 252)])
+@pytest.mark.parametrize(("view_side", "side"), [("photos", 1008), (300, 300), (504, 504)])
 def test_views_have_the_side_that_is_asked_for(view_side, side):
     config = replace(method_config("hier-style").pipeline, view_side=view_side)
     assert 1008 * config.share_of_photos(1.0, 1008) == pytest.approx(side)

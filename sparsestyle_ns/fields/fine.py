@@ -59,11 +59,8 @@ class FineFieldConfig:
     """Levels of the hash grid (M)."""
     min_resolution: int = 16
     """Cells along the cube's side on the first level (N_min). The paper's is 128; coarser ones make wider strokes."""
-    max_resolution: int = 256
-    """Cells along the cube's side on the last level (N_max). The paper's is 512; in cells as fine as pixels
-    new views see grain."""
-    object_cells: float = 2.0
-    """How many times as many cells the last level has for an object on a background, which fills a part of the cube."""
+    max_resolution: int = 512
+    """Cells along the cube's side on the last level (N_max)."""
     depth_cells: float = 1 / 16
     """Cells along depth as a share of those across, from 0 to 1, where all cameras look one way (NDC). Photos hardly
     say at which depth a surface is: where colour may change along depth as fast as across, strokes become the surfaces'
@@ -86,28 +83,26 @@ class FineFieldConfig:
             self.fine_encoding = "tiny-cuda-nn" if is_there else "hash"
 
     def new_field(
-        self, coarse: CoarseField, with_density: bool, is_object: bool, looks_ahead: bool, device: torch.device
+        self, coarse: CoarseField, with_density: bool, looks_ahead: bool, device: torch.device
     ) -> StylisedField:
         """A field as it is before training, to be used on `device`; a copy of `coarse` starts from its weights.
 
         Args:
             with_density: whether it has a residual density.
-            is_object: whether the scene is an object on a background.
             looks_ahead: whether all cameras look one way, and the third of the field coordinates is depth.
         """
         if self.stylised_field == "coarse":
             return FineTunedField(copy.deepcopy(coarse).requires_grad_(True))
         sizes = coarse.feature_dim, self.hidden_layers, self.layer_width
         stretch = (1.0, 1.0, self.depth_cells if looks_ahead else 1.0)
-        encoding = self._encoding(is_object, device)
+        encoding = self._encoding(device)
         return ResidualField(encoding, *sizes, self.residual_density_scale, with_density, stretch)
 
-    def _encoding(self, is_object: bool, device: torch.device) -> PointEncoding:
+    def _encoding(self, device: torch.device) -> PointEncoding:
         if self.fine_encoding == "none":
             return NoEncoding()
         if self.fine_encoding == "frequency":
             return FrequencyEncoding(self.frequency_levels)
-        times = self.object_cells if is_object else 1.0
-        resolutions = self.min_resolution, round(times * self.max_resolution)
+        resolutions = self.min_resolution, self.max_resolution
         shape = (self.hash_levels, *resolutions, self.features_per_level, self.log2_table_size)
         return TinyCudaGrid(*shape, device=device) if self.fine_encoding == "tiny-cuda-nn" else HashGrid(*shape)

@@ -12,7 +12,7 @@ from sparsestyle_ns.losses.stylization_loss import StylizationLoss, StylizedView
 class ContentLoss(StylizationLoss):
     """L_content of Eq. 5; its weight is λ0 (Eq. 6). The paper's is 10, for a loss in other units."""
 
-    weight = 0.1
+    weight = 2.0
 
     def __call__(self, view: StylizedView) -> Float[Tensor, ""]:
         """See `content_loss`."""

@@ -94,8 +94,6 @@ class HierStyleModel(SceneModel):
             if (count := getattr(config, name)) is not None and count < 1:
                 flag = name.replace("_", "-")
                 raise InputError(f"--pipeline.model.{flag} is {count}; give 1 or more, or None.")
-        if not 0.0 < config.object_cells < math.inf:
-            raise InputError(f"--pipeline.model.object-cells is {config.object_cells}; give a number above 0.")
         if not 0.0 <= config.even_share < 1.0:
             raise InputError(f"--pipeline.model.even-share is {config.even_share}; give a number from 0 to below 1.")
         self.display = Display(Look(config.render_mode, Mix(config.strength, config.geometry_strength)))
@@ -106,8 +104,8 @@ class HierStyleModel(SceneModel):
 
     def new_style(self) -> StylisedField:
         """A field to be stylised, as it is before training, on the coarse field's device."""
-        with_density, is_object = self.effects.on("residual_density"), self.background is not None
-        new = self.config.new_field(self.field, with_density, is_object, self.effects.on("ndc"), self._built_for())
+        effects = self.effects.on("residual_density"), self.effects.on("ndc")
+        new = self.config.new_field(self.field, *effects, self._built_for())
         return new.to(next(self.field.parameters()).device)
 
     def _built_for(self) -> torch.device:

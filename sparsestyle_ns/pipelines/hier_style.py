@@ -26,8 +26,6 @@ from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress import say
 
-USUAL_VIEW_SIDE = 252
-"""Longer side, in pixels, of the views of a whole scene that are stylised."""
 STROKE_SIZES = (0.5, 2.0)
 """The smallest and the largest."""
 
@@ -44,15 +42,13 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     coarse_run: Annotated[Optional[Path], tyro.conf.arg(aliases=("--coarse-run",))] = None
     """Folder or config.yml of the coarse-fewshot run to stylise. None: the newest finished one that matches the data
     and its settings, and where there is none it is trained first."""
-    view_side: Union[int, Literal["auto", "photos"]] = "auto"
+    view_side: Union[int, Literal["photos"]] = 504
     """Longer side, in pixels, of the views that are stylised, where photos are larger; as many times more as strokes
-    are finer than 1. Pictures are of any size all the same. auto: 252, and for an object on a background the photos'
-    size. Larger views take longer, and the style loss asks there for marks that are finer than what few photos of a
-    whole scene agree on; an object, seen from all around, holds more."""
-    view_scales: Tuple[float, ...] = (0.5, 1.0)
+    are finer than 1. photos: always theirs. Pictures are of any size all the same."""
+    view_scales: Tuple[float, ...] = (0.25, 0.5, 1.0)
     """Sizes at which the views are stylised, one after another, as shares of `view_side`; the last is the one that
     counts, and iterations before it are quick."""
-    scale_shares: Tuple[float, ...] = (0.5, 0.5)
+    scale_shares: Tuple[float, ...] = (0.6, 0.3, 0.1)
     """Shares of the iterations at these sizes."""
     stroke_size: Annotated[float, tyro.conf.arg(aliases=("--stroke-size",))] = 1.0
     """How wide strokes are, from 0.5 to 2: the feature network sees views and painting in this many times smaller
@@ -100,7 +96,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
             if not 0.0 <= weight < math.inf:
                 raise InputError(f"--pipeline.loss-weights.{name} is {weight}; give a finite number, 0 or more.")
         if isinstance(self.view_side, int) and self.view_side < 1:
-            raise InputError(f"--pipeline.view-side is {self.view_side}; give a number of pixels, auto, or photos.")
+            raise InputError(f"--pipeline.view-side is {self.view_side}; give a number of pixels, or photos.")
         if not 0.0 < self.object_style < math.inf:
             raise InputError(f"--pipeline.object-style is {self.object_style}; give a number above 0.")
         if not any(self.loss_weights.values()):
@@ -125,9 +121,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         return max(1, round(scale * largest / self.stroke_size))
 
     def _largest_side(self, photo_side: int) -> int:
-        if isinstance(self.view_side, int):
-            return self.view_side
-        return photo_side if self.view_side == "photos" else USUAL_VIEW_SIDE
+        return photo_side if self.view_side == "photos" else self.view_side
 
     def targets_of(
         self, painting: Painting, backbone: Backbone, device: torch.device, photo_side: int, scale: float = 1.0
@@ -186,11 +180,6 @@ class HierStylePipeline(CheckedPipeline):
     """What this run trains, once it is set up."""
     on_losses: Optional[Callable[[int, Losses], None]] = None
     """Told of each iteration and its losses, by a viewer that shows them."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        if self.config.view_side == "auto" and self.model.background is not None:
-            self.config.view_side = "photos"
 
     def new_task(
         self,

@@ -109,7 +109,7 @@ OF_STAGE_2 = (
         "Content annealing (Fig. 8)",
         "The content weight falling from 10 to 0.1, and constant ones. Pictures are a held-out photo, the unstylised "
         "view, and the stylised one.",
-        {"ours": OURS, **{f"λ = {weight}": (f"lambda-{weight}", "ours") for weight in ("0.1", "0.01", "0.001")}},
+        {"ours": OURS, **{f"λ = {weight}": (f"lambda-{weight}", "ours") for weight in ("2", "0.2", "0.02")}},
         with_training=True,
     ),
 )

@@ -38,14 +38,13 @@ def make_model(effects=SPARE, **settings):
     return model
 
 
-def make_untrained(effects=SPARE, seed=0, device="cpu", ndc=None, object_cells=1.0, **settings):
+def make_untrained(effects=SPARE, seed=0, device="cpu", ndc=None, **settings):
     torch.manual_seed(seed)
     config = HierStyleModelConfig(
         coarse_field=CoarseFieldConfig(num_levels=3, num_layers=2, layer_width=16, feature_dim=4, direction_levels=2),
         hash_levels=2,
         min_resolution=4,
         max_resolution=8,
-        object_cells=object_cells,
         log2_table_size=8,
         layer_width=16,
         num_steps=24,
@@ -61,10 +60,6 @@ def make_untrained(effects=SPARE, seed=0, device="cpu", ndc=None, object_cells=1
 @pytest.fixture
 def model():
     return make_model(render_mode="baked")
-
-
-def test_an_object_on_a_background_has_more_cells():
-    assert make_untrained(object_cells=2.0).residual.grid.resolutions == (4, 16)
 
 
 def test_only_a_scene_seen_from_one_side_has_fewer_cells_along_depth():

@@ -11,11 +11,9 @@ import torch
 from torch.nn.functional import interpolate
 
 from sparsestyle_ns.core.schedules import Level
-from sparsestyle_ns.effects.decisions import Decision
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.engine.restyling import Restyling, Workshop
 from sparsestyle_ns.engine.training import Training
-from sparsestyle_ns.pipelines import hier_style
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig, StyleLevel, StyleTask
 from sparsestyle_ns.runs.coarse_run import read_coarse_run
 from sparsestyle_ns.style.painting import Painting
@@ -95,17 +93,12 @@ def test_ten_iterations_are_six_small_ones_and_four_of_the_photos_size(training)
     assert shapes == [(11, 14, 3)] * 2 + [(24, 32, 3)] * 2
 
 
-@pytest.mark.parametrize(("is_object", "size"), [(False, (12, 16)), (True, (24, 32))])
-def test_views_of_a_whole_scene_are_reduced_and_those_of_an_object_are_not(runs, monkeypatch, is_object, size):
-    monkeypatch.setattr(hier_style, "USUAL_VIEW_SIDE", 16)
+def test_views_are_no_larger_than_they_are_asked_for(runs):
     config = copy.deepcopy(load_run(runs.style / "config.yml").config)
+    config.pipeline.view_side = 16
     config.pipeline.view_scales, config.pipeline.scale_shares, config.pipeline.warm_start_steps = (1.0,), (1.0,), 0
-    if is_object:
-        background = Decision("background", True, 1.0, 0.5, "", parameters={"color": [1.0, 1.0, 1.0]})
-        config.pipeline.decided = config.pipeline.decided.replaced(background)
     training = Training(config, torch.device("cpu"), read_coarse_run(runs.coarse).model_state())
-    assert (training.pipeline.model.background is not None) == is_object
-    assert all(view.picture.shape == (*size, 3) for view in training.pipeline.scene_views.views)
+    assert all(view.picture.shape == (12, 16, 3) for view in training.pipeline.scene_views.views)
 
 
 def test_each_size_has_all_views_photos_first_and_those_between_them_too(training):

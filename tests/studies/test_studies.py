@@ -121,7 +121,7 @@ def test_every_setting_of_every_kind_is_one_of_its_method(llff_scene: Path, pain
     assert all(parsed[run.name].logging.steps_per_log == 1 for run in found)
     assert {parsed[run.name].pipeline.backbone for run in found} == {runs.found_backbone} == {"vgg16-shift-tolerant"}
     assert {round(weight, 9) for weight in content_weights(settings["ours"])} >= {0.1, 0.001}
-    for kind, weight in {"lambda-0.1": 0.1, "lambda-0.01": 0.01, "lambda-0.001": 0.001, "arf": 0.1}.items():
+    for kind, weight in {"lambda-2": 2.0, "lambda-0.2": 0.2, "lambda-0.02": 0.02, "arf": 0.1}.items():
         assert content_weights(settings[kind]) == {weight}, kind
     assert all(parsed[run.name].pipeline.style_image == painting for run in found)
 
