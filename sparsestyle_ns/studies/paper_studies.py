@@ -14,7 +14,7 @@ from sparsestyle_ns.metrics.art_fid import why_left_out
 from sparsestyle_ns.runs.scene_record import SceneRecord
 from sparsestyle_ns.studies.baselines import can_transfer, smooth_along_flow, transfer_frames
 from sparsestyle_ns.studies.front import front_section
-from sparsestyle_ns.studies.paper_runs import PICTURES, PaperRuns
+from sparsestyle_ns.studies.paper_runs import CONTENT_WEIGHTS, PICTURES, PaperRuns
 from sparsestyle_ns.studies.plots import line_plot
 from sparsestyle_ns.studies.run_figures import (
     PaintingMeasure,
@@ -107,9 +107,9 @@ OF_STAGE_2 = (
     ),
     Comparison(
         "Content annealing (Fig. 8)",
-        "The content weight falling from 10 to 0.1, and constant ones. Pictures are a held-out photo, the unstylised "
-        "view, and the stylised one.",
-        {"ours": OURS, **{f"λ = {weight}": (f"lambda-{weight}", "ours") for weight in ("2", "0.2", "0.02")}},
+        f"The content weight falling from {CONTENT_WEIGHTS[0]:g} to {CONTENT_WEIGHTS[-1]:g}, and constant ones. Pictures "
+        "are a held-out photo, the unstylised view, and the stylised one.",
+        {"ours": OURS, **{f"λ = {weight:g}": (f"lambda-{weight:g}", "ours") for weight in CONTENT_WEIGHTS}},
         with_training=True,
     ),
 )
