@@ -107,8 +107,8 @@ OF_STAGE_2 = (
     ),
     Comparison(
         "Content annealing (Fig. 8)",
-        f"The content weight falling from {CONTENT_WEIGHTS[0]:g} to {CONTENT_WEIGHTS[-1]:g}, and constant ones. Pictures "
-        "are a held-out photo, the unstylised view, and the stylised one.",
+        f"The content weight falling from {CONTENT_WEIGHTS[0]:g} to {CONTENT_WEIGHTS[-1]:g}, and constant ones. "
+        "Pictures are a held-out photo, the unstylised view, and the stylised one.",
         {"ours": OURS, **{f"λ = {weight:g}": (f"lambda-{weight:g}", "ours") for weight in CONTENT_WEIGHTS}},
         with_training=True,
     ),
