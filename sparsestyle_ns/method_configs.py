@@ -62,7 +62,7 @@ def variant(of: MethodSpecification, suffix: str, description: str, settings: Di
 
 coarse_fewshot = method(
     SparseStyleTrainerConfig,
-    "Coarse radiance field from three to eight photos (stage 1): under four minutes on two CPU cores at 504 pixels.",
+    "Coarse radiance field from three to eight photos (stage 1): under five minutes on two CPU cores at 504 pixels.",
     _target=CoarseFewShotTrainer,
     method_name="coarse-fewshot",
     max_num_iterations=2500,
