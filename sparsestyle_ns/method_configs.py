@@ -115,6 +115,7 @@ hier_style_draft = variant(
         **DRAFT,
         "coarse_method": coarse_fewshot_draft_config,
         "max_num_iterations": 80,
+        "pipeline.view_side": 252,
         "pipeline.view_scales": (0.5, 1.0),
         "pipeline.scale_shares": (0.85, 0.15),
         "pipeline.model.max_resolution": 256,

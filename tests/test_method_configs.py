@@ -36,15 +36,17 @@ def test_stage_1_learns_matrices_with_muon_and_all_else_with_adam_both_slower_an
         assert 0.0 < group["scheduler"].final < 1.0
 
 
-@pytest.mark.parametrize("variant", ["", "-draft"])
-def test_stage_2_goes_from_126_to_252_pixels_whatever_the_photos_are(variant):
+@pytest.mark.parametrize(("variant", "expected"), [("", [126, 252, 504]), ("-draft", [126, 252])])
+def test_stage_2_goes_from_126_pixels_to_what_is_shown(variant, expected):
     config = method_config(f"hier-style{variant}")
-    small, large = config.pipeline.levels(config.max_num_iterations)
-    assert small.length >= large.length > 0 and small.length + large.length == config.max_num_iterations
-    for photo_side in (252, 504, 1008):
-        sides = [photo_side * config.pipeline.share_of_photos(level.scale, photo_side) for level in (small, large)]
-        seen = [config.pipeline.side_at(level.scale, photo_side) for level in (small, large)]
-        assert sides == pytest.approx([126, 252]) and seen == [126, 252]
+    levels = config.pipeline.levels(config.max_num_iterations)
+    lengths = [level.length for level in levels]
+    assert lengths == sorted(lengths, reverse=True) and sum(lengths) == config.max_num_iterations
+    for photo_side in (504, 1008):
+        sides = [photo_side * config.pipeline.share_of_photos(level.scale, photo_side) for level in levels]
+        seen = [config.pipeline.side_at(level.scale, photo_side) for level in levels]
+        assert sides == pytest.approx(expected) and seen == expected
+    assert [config.pipeline.side_at(level.scale, 252) for level in levels][-1] == 252
 
 
 def test_views_are_as_much_larger_as_strokes_are_finer_up_to_the_photos_size():
