@@ -232,6 +232,7 @@ def trainer_at_end(place: SimpleNamespace):
     trainer = CoarseFewShotTrainer.__new__(CoarseFewShotTrainer)
     trainer.pipeline, trainer.config, trainer.record = coarse_pipeline(place.scene), config, None
     trainer.checkpoint_dir, trainer.grad_scaler = Path("models"), None
+    trainer.base_dir, trainer._kept_step = Path("."), 0
     trainer._look_at_skipped, trainer._interrupted = (lambda step: 0), False
     trainer.optimizers = SimpleNamespace(optimizers={}, schedulers={})
     return trainer

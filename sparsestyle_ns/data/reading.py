@@ -49,7 +49,7 @@ def _check_capture(path: Path, is_scaled: bool) -> None:
                 f"Frames {before} and {index} (from 0) of {path} are both of {frame['file_path']}: drop one of them."
             )
     model = content.get("camera_model", "OPENCV")
-    if model not in CAMERA_MODEL_TO_TYPE:
+    if not isinstance(model, str) or model not in CAMERA_MODEL_TO_TYPE:
         raise InputError(f"{path} has the camera_model {_shown(model)}: name one of {', '.join(CAMERA_MODEL_TO_TYPE)}.")
     places = np.array([np.array(frame["transform_matrix"], float)[:3, 3] for frame in content["frames"]])
     if is_scaled and np.ptp(places, axis=0).max() == 0:

@@ -60,8 +60,8 @@ def test_collect_run_shows_photos_and_held_out_views_wherever_the_run_is_now(run
             assert pixels.shape == (24, 32, 3)
             assert pixels.dtype == np.uint8
     assert dict(run.settings)["Iterations"] == "3 of 3"
-    assert dict(run.settings)["Size it sees views at"] == "24 pixels in 2 iterations, then 48 pixels in 1 iterations"
-    assert dict(run.settings)["Content weight λ"] == "0.1 to 0.001 in 1 iterations, then 0.03 to 0.001 in 1 iterations"
+    assert dict(run.settings)["Size it sees views at"] == "12 pixels in 2 iterations, then 48 pixels in 1 iterations"
+    assert dict(run.settings)["Content weight λ"] == "2 to 0.02 in 1 iterations, then 0.6 to 0.02 in 1 iterations"
     assert run.subtitle == "hier-style, 3 photos, 3 iterations"
     assert run.style_name == "painting"
     assert [table.title for table in run.tables] == ["Mean of the views above, 2"]
@@ -88,7 +88,9 @@ def test_a_painting_is_shown_as_it_was_read(runs, tmp_path):
     """Transparent pixels over white, as in training."""
     moved = tmp_path / "outputs" / "scene" / "hier-style" / "run"
     shutil.copytree(runs.style, moved)
-    Image.new("RGBA", (16, 8), (255, 0, 0, 0)).save(tmp_path / "clear.png")
+    painting = Image.new("RGBA", (16, 8), (255, 0, 0, 0))
+    painting.putpixel((0, 0), (255, 255, 255, 255))
+    painting.save(tmp_path / "clear.png")
     config = yaml.load((moved / "config.yml").read_text(), Loader=yaml.Loader)
     config.pipeline.style_image = tmp_path / "clear.png"
     (moved / "config.yml").write_text(yaml.dump(config))

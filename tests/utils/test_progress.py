@@ -3,6 +3,7 @@
 import io
 import re
 import threading
+from pathlib import Path
 
 import pytest
 from nerfstudio.engine.trainer import Trainer
@@ -162,7 +163,7 @@ def test_a_closed_viewer_ends_training_without_a_traceback(monkeypatch: pytest.M
 
     monkeypatch.setattr(Trainer, "_train_complete_viewer", close)
     trainer = CoarseFewShotTrainer.__new__(CoarseFewShotTrainer)
-    trainer.config = method_config("coarse-fewshot")
+    trainer.config, trainer.base_dir = method_config("coarse-fewshot"), Path("run")
     said = []
     trainer.finish = lambda: said.append("the last line")
     trainer._train_complete_viewer()
