@@ -7,16 +7,22 @@ import time
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Callable
+from typing import Any, Callable, List
 
 import pytest
 import torch
-from conftest import TINY_STYLE, ns_train
+from conftest import TINY_STYLE, ns_train, only_run
 
 from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.engine.style_trainer import HierStyleTrainer
 from sparsestyle_ns.runs.checkpoints import newest_checkpoint
 from sparsestyle_ns.utils.interrupts import StoppedByCtrlC
+
+
+def flags_of(runs: SimpleNamespace, painting: Path, iterations: int) -> List[str]:
+    """Those of a short stage 2."""
+    length = ["--max-num-iterations", str(iterations)]
+    return ["--style-image", str(painting), "--coarse-run", str(runs.coarse), *TINY_STYLE, *length]
 
 
 def train_with_viewer(
@@ -29,7 +35,7 @@ def train_with_viewer(
     at_step: int,
     iterations: int = 3,
 ) -> Path:
-    """Trains as `runs.style` was trained, with the viewer, and has `act(trainer)` called in another thread at a step.
+    """Trains with the viewer, and has `act(trainer)` called in another thread at a step.
 
     Training is paused, as by the viewer's button, when that thread begins.
     """
@@ -56,11 +62,10 @@ def train_with_viewer(
     monkeypatch.setattr(HierStyleTrainer, "train_iteration", iterate)
     monkeypatch.setattr("sparsestyle_ns.viewer.restyling_controls.SECONDS_BETWEEN_TEXTS", 0.0)
     viewer = ["--viewer.websocket-port", str(port), "--viewer.websocket-host", "127.0.0.1"]
-    flags = ["--style-image", str(painting), "--coarse-run", str(runs.coarse), *TINY_STYLE, *viewer]
-    flags += ["--max-num-iterations", str(iterations), "--vis", "viewer+tensorboard"]
+    viewer += ["--vis", "viewer+tensorboard"]
     try:
         with suppress(StoppedByCtrlC):
-            ns_train("hier-style", scene, outputs, *flags)
+            ns_train("hier-style", scene, outputs, *flags_of(runs, painting, iterations), *viewer)
     finally:
         for trainer in seen:
             trainer.viewer_state.viser_server.stop()
@@ -74,6 +79,8 @@ def test_losses_are_shown_pausing_pauses_and_a_restyling_leaves_training_as_it_i
     runs: SimpleNamespace, llff_scene: Path, painting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = []
+    ns_train("hier-style", llff_scene, tmp_path / "b", *flags_of(runs, painting, 3))
+    undisturbed = only_run(tmp_path / "b", "hier-style")
 
     def act(trainer: Any) -> None:
         panel = trainer.pipeline.panel
@@ -96,10 +103,11 @@ def test_losses_are_shown_pausing_pauses_and_a_restyling_leaves_training_as_it_i
     (saved,) = (folder for folder in run.parent.iterdir() if folder != run)
     _, pipeline, _ = load_run(saved / "config.yml")
     assert pipeline.config.coarse_run == runs.coarse.resolve()
-    states = [newest_checkpoint(folder / "nerfstudio_models") for folder in (run, runs.style)]
+    states = [newest_checkpoint(folder / "nerfstudio_models") for folder in (run, undisturbed)]
     found, expected = (torch.load(path, weights_only=True)["pipeline"] for path in states)
     assert found.keys() == expected.keys()
-    assert all(torch.equal(found[name], expected[name]) for name in expected)
+    for name, value in expected.items():
+        assert torch.equal(found[name], value), name
 
 
 def test_ctrl_c_ends_a_paused_run_with_a_checkpoint(
