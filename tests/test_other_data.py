@@ -214,7 +214,9 @@ def test_a_run_that_lies_at_the_root_of_a_disk_opens(project: SimpleNamespace, t
     assert pipeline.datamanager.config.data == project.scene
 
 
-def test_what_is_said_of_a_scene_that_moved_alone_can_be_done(project: SimpleNamespace, tmp_path: Path) -> None:
+def test_what_is_said_of_a_scene_that_moved_alone_can_be_done(
+    project: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     elsewhere = project.scene.rename(tmp_path / "elsewhere")
     message = refused(["evaluate", project.coarse])
     record = project.coarse / RECORD_FILE
@@ -223,6 +225,7 @@ def test_what_is_said_of_a_scene_that_moved_alone_can_be_done(project: SimpleNam
         ns_command("ns-eval", "--load-config", project.coarse / "config.yml", "--output-path", tmp_path / "a.json")
     record.write_text(json.dumps({**json.loads(record.read_text()), "data": str(elsewhere)}))
     main(["evaluate", str(project.coarse)])
+    assert capsys.readouterr().out.rstrip().endswith(f"--data {elsewhere} llff-data")
     ns_command("ns-eval", "--load-config", project.coarse / "config.yml", "--output-path", tmp_path / "a.json")
     ns_command(
         *("ns-render", "dataset", "--load-config", project.coarse / "config.yml", "--data", elsewhere),

@@ -37,9 +37,9 @@ def after_evaluation(run: Path, stylised: bool) -> List[str]:
     if stylised:
         return ["sparsestyle", "gallery", str(run)]
     config = read_coarse_run(run).config
-    if config.get_base_dir().resolve() != run.resolve():  # it has moved, and its scene perhaps, too
+    config.pipeline.datamanager.data = SceneRecord.load(run).find_data(run.resolve())  # wherever that is by now
+    if config.get_base_dir().resolve() != run.resolve():  # the run has moved
         config.output_dir = Path("outputs")
-        config.pipeline.datamanager.data = SceneRecord.load(run).find_data(run.resolve())
     return ns_train_style(run, config)
 
 
