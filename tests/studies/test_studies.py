@@ -208,6 +208,7 @@ def test_compare_trains_what_is_missing_measures_each_row_and_writes_the_page(
     assert not any(shown(name) in page for name in ROWS_OF_2D.values())
 
 
+@pytest.mark.slow
 def test_compare_draws_style_against_content_in_equal_time(
     llff_scene: Path, painting: Path, tmp_path: Path, train_here: list, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -243,6 +244,7 @@ def test_a_front_is_read_between_its_points_and_not_beyond() -> None:
     assert front.at_kept(points, "none", "style_loss", 0.4) is None
 
 
+@pytest.mark.slow
 def test_figures_are_measured_again_when_a_run_has_gone_on(
     llff_scene: Path, painting: Path, tmp_path: Path, train_here: list
 ) -> None:
