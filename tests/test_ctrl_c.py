@@ -194,7 +194,10 @@ def test_the_viewer_is_closed_by_ctrl_c(runs):
             printed += line
         time.sleep(2.0)
         viewer.send_signal(signal.SIGINT)
-        printed += viewer.communicate(timeout=120)[0]
+        try:
+            printed += viewer.communicate(timeout=120)[0]
+        finally:
+            viewer.kill()
     assert viewer.returncode == 130, printed[-3000:]
     assert "Traceback" not in printed
     assert printed.splitlines()[-1] == "Stopped by Ctrl-C."
@@ -295,3 +298,31 @@ def test_a_run_that_is_not_there_is_said_where_it_would_be_one_of_these_methods(
         return
     with pytest.raises(SystemExit, match=sentence):
         interrupts.guard_nerfstudio(("coarse-fewshot", "hier-style"))
+
+
+LOST = """
+import time
+from sparsestyle_ns.utils import interrupts
+
+class Slow:
+    def __del__(self):
+        print("here", flush=True)
+        time.sleep(60)
+
+interrupts.end_on_ctrl_c()
+slow = Slow()
+del slow
+while True:
+    time.sleep(0.01)
+"""
+
+
+def test_a_press_that_python_loses_while_it_clears_up_counts_all_the_same():
+    with subprocess.Popen([sys.executable, "-c", LOST], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"here\n"
+        process.send_signal(signal.SIGINT)
+        try:
+            printed = process.communicate(timeout=60)[1].decode()
+        finally:
+            process.kill()
+    assert process.returncode == 130 and printed == "Stopped by Ctrl-C.\n"

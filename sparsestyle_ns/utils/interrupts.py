@@ -13,15 +13,18 @@ import sys
 import threading
 import time
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Callable, Iterator, List, NoReturn, Optional, Tuple
+from typing import Any, Callable, Iterator, List, NoReturn, Optional, Tuple
 
 STATUS = 130
 """Exit status after Ctrl-C, as shells have it: 128 and the signal's number."""
 SENTENCE = "Stopped by Ctrl-C."
 SECONDS_OF_GRACE = 5.0
 """After Ctrl-C what is half made is taken away; to press it again ends the process at once only after so long."""
+SECONDS_UNTIL_AGAIN = 0.1
+"""After which a press that was lost is made again: what lost it has come to its end by then."""
 NS_COMMANDS = {"train": "train", "render": "render", "eval": "eval", "exporter": "export", "run_viewer": "viewer"}
 """nerfstudio's modules of commands, and the commands' names behind `ns-`."""
 
@@ -54,6 +57,7 @@ def end_on_ctrl_c() -> None:
     is_free = threading.current_thread() is threading.main_thread()
     if is_free and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _on_press)
+        sys.unraisablehook = partial(_on_unraisable, sys.unraisablehook)
         atexit.register(lambda: None if _pressed_at is None else _say(SENTENCE))  # once all has come to its end
 
 
@@ -174,6 +178,21 @@ def _on_press(number: int, frame: Optional[FrameType]) -> None:
                 leftover()
         _say(SENTENCE)
         os._exit(STATUS)
+
+
+def _on_unraisable(before: Callable[[Any], None], lost: Any) -> None:
+    """A press while Python clears something away, or while C calls it back, is lost there: it is made again."""
+    if not issubclass(lost.exc_type, StoppedByCtrlC):
+        return before(lost)
+    again = threading.Timer(SECONDS_UNTIL_AGAIN, _press_again)
+    again.daemon = True
+    again.start()
+
+
+def _press_again() -> None:
+    global _pressed_at
+    _pressed_at = None
+    signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
 
 def _say(sentence: str) -> None:
