@@ -1,6 +1,7 @@
 """ns-viewer on a real run, looked at and acted in through a browser."""
 
 import json
+import math
 import os
 import re
 import socket
@@ -14,8 +15,15 @@ from typing import Iterator
 
 import numpy as np
 import pytest
+import torch
 from chromium import Tab, needs_chromium, open_tab
 from conftest import run_entrypoint
+
+from sparsestyle_ns.core.camera_paths import most_central
+from sparsestyle_ns.engine.loading import load_run
+from sparsestyle_ns.export.gaussians import Gaussians
+from sparsestyle_ns.export.splat_file import encode_splats
+from sparsestyle_ns.viewer.splat_controls import FILE_NAME
 
 WIDTH, HEIGHT = 760, 440  # small: a browser without a GPU draws it over and over
 SCRIPT = "from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"
@@ -192,6 +200,29 @@ def test_the_split_shows_the_coarse_field_on_the_left(page: Page) -> None:
     page.slide("Strength", "End")
     page.tab.evaluate("near('Coarse | stylised', 'input[type=checkbox]').click()")
     page.scene_like(stylised)
+
+
+@needs_chromium
+def test_a_file_of_splats_is_drawn_where_the_picture_is(page: Page, server: SimpleNamespace) -> None:
+    picture = page.scene()
+    cameras = load_run(server.run / "config.yml").pipeline.datamanager.train_dataset.cameras
+    pose = cameras.camera_to_worlds[most_central(cameras)]  # the viewer begins there
+    ball = 0.02 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
+    one = torch.tensor([*3 * [math.log(0.02)], 1.0, 0.0, 0.0, 0.0, 9.0, 1.0, 0.0, 0.0])  # red, and dense
+    splats = Gaussians(torch.cat([pose[:, 3] - 0.5 * pose[:, 2] + ball, one.expand(len(ball), -1)], dim=-1))
+    (server.run / FILE_NAME).write_bytes(encode_splats(splats))
+    page.click("Splats")
+    page.wait_for("!!leaf('Show the splats')")
+    page.tab.evaluate("near('Show the splats', 'input[type=checkbox]').click()")
+    page.wait_for("document.body.innerText.includes('200 splats')")
+    redder = (page.scene_unlike(picture) - picture) @ np.array([1.0, -0.5, -0.5])
+    rows, columns = np.nonzero(redder > 60)
+    assert len(rows) > 1000
+    # In the middle of the picture, which the panel leaves 440 pixels of.
+    assert abs(rows.mean() + 60 - 245) < 20 and abs(columns.mean() + 10 - 220) < 20
+    page.tab.evaluate("near('Show the splats', 'input[type=checkbox]').click()")
+    page.scene_like(picture)
+    page.click("Splats")
 
 
 @needs_chromium
