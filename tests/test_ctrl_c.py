@@ -317,8 +317,23 @@ while True:
 """
 
 
-def test_a_press_that_python_loses_while_it_clears_up_counts_all_the_same():
-    with subprocess.Popen([sys.executable, "-c", LOST], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+SWALLOWED = """
+import time
+from sparsestyle_ns.utils import interrupts
+
+interrupts.end_on_ctrl_c()
+try:
+    print("here", flush=True)
+    time.sleep(60)
+except BaseException:
+    pass
+exec("while True: time.sleep(0.01)", {"__name__": interrupts.VIEWER_MODULE, "time": time})
+"""
+
+
+@pytest.mark.parametrize("script", [LOST, SWALLOWED], ids=["while Python clears up", "by a library"])
+def test_a_press_that_is_lost_counts_all_the_same(script):
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout.readline() == b"here\n"
         process.send_signal(signal.SIGINT)
         try:

@@ -25,6 +25,9 @@ SECONDS_OF_GRACE = 5.0
 """After Ctrl-C what is half made is taken away; to press it again ends the process at once only after so long."""
 SECONDS_UNTIL_AGAIN = 0.1
 """After which a press that was lost is made again: what lost it has come to its end by then."""
+SECONDS_UNTIL_MINDED = 1.0
+VIEWER_MODULE = "nerfstudio.scripts.viewer.run_viewer"
+"""Whose main thread sleeps until Ctrl-C."""
 NS_COMMANDS = {"train": "train", "render": "render", "eval": "eval", "exporter": "export", "run_viewer": "viewer"}
 """nerfstudio's modules of commands, and the commands' names behind `ns-`."""
 
@@ -171,6 +174,7 @@ def _on_press(number: int, frame: Optional[FrameType]) -> None:
     global _pressed_at
     if _pressed_at is None:
         _pressed_at = time.monotonic()
+        threading.Thread(target=_mind_swallowed, daemon=True).start()
         raise StoppedByCtrlC
     if time.monotonic() - _pressed_at > SECONDS_OF_GRACE:
         for leftover in _leftovers:
@@ -178,6 +182,17 @@ def _on_press(number: int, frame: Optional[FrameType]) -> None:
                 leftover()
         _say(SENTENCE)
         os._exit(STATUS)
+
+
+def _mind_swallowed() -> None:
+    """Makes a press again that the C code of some library has swallowed: nerfstudio's viewer would wait for ever."""
+    while True:
+        time.sleep(SECONDS_UNTIL_MINDED)
+        frame = sys._current_frames().get(threading.main_thread().ident)
+        if frame is None:
+            return
+        if frame.f_globals.get("__name__") == VIEWER_MODULE:
+            return _press_again()
 
 
 def _on_unraisable(before: Callable[[Any], None], lost: Any) -> None:
