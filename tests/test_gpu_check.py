@@ -120,6 +120,7 @@ def test_the_devices_are_compared_on_a_second_device(run, capsys, monkeypatch):
 def test_the_script_runs_on_a_cpu(tmp_path):
     command = ["bash", "benchmarks/gpu_check.sh", "--device", "cpu", "--quick", "--skip", "bench", "--minutes", "30"]
     environment = {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin", "PYTHON": sys.executable}
+    environment["OMP_NUM_THREADS"] = "1"  # other tests run beside it
     ended = subprocess.run(
         [*command, "--output-dir", str(tmp_path)], cwd=ROOT, env=environment, capture_output=True, text=True
     )
