@@ -44,12 +44,12 @@ from sparsestyle_ns.utils.machine import device_name, synchronize, versions
 LEAST_PSNR = 30.0
 """dB between a view of the coarse field after 50 steps on the device and on the CPU. Rounding grows from step to step,
 and Muon multiplies in bfloat16. On one CPU, weights that differ by 1e-6 at the start end 51 dB apart (fern)."""
-MOST_GRADIENT = 0.02
+MOST_GRADIENT = 0.05
 """Relative distance of the gradients of a step of stage 2. Of samples that are drawn and neighbours that are nearest by
-a hair, some are others."""
-LEAST_BAKED_PSNR = 40.0
-"""dB between baked views of the same fields; a step of a byte's code may go either way, and rays are marched in another
-way on a CPU."""
+a hair, some are others: 0.8% on one CPU between coarse fields whose weights differ by 1e-6 (fern at 126 pixels)."""
+LEAST_BAKED_PSNR = 25.0
+"""dB between baked views of the same fields. Cells that are empty by a hair aren't everywhere, and rays are marched in
+another way on a CPU: 33 dB between those two fields, whose colours are much wilder than a style's."""
 BENCHMARKS = ("hash_grid", "nnfm", "stage2_step", "render", "memory", "profile", "torch_options")
 """Those of `make bench` that take seconds on a GPU, those that the table lacks last."""
 SMALLEST = CoarseFieldConfig(num_levels=3, num_layers=2, layer_width=32, feature_dim=8)
@@ -149,6 +149,17 @@ def likeness(first: Tensor, second: Tensor) -> float:
     return min(100.0, psnr(first, second))
 
 
+@torch.no_grad()
+def paint(training: Training) -> None:
+    """Gives a field that is to be stylised shapes and colours, the same on all devices: it begins grey all over."""
+    generator = torch.Generator().manual_seed(0)
+    for name, part in training.pipeline.model.residual.named_parameters():
+        if part.dim() == 2:
+            # More from the grid would make each cell another colour, which moves with a sample's last digit.
+            size = 0.1 if name == "grid.table" else (2.0 / part.shape[1]) ** 0.5
+            part.copy_(size * torch.randn(part.shape, generator=generator))
+
+
 def style_gradients(training: Training) -> Tensor:
     """Gradients of the first step of stage 2, one after another, on the CPU."""
     with comparable():
@@ -172,6 +183,7 @@ def check_equal(check: "Check") -> Dict[str, float]:
     for device in devices:
         with comparable():
             style = Training(copy.deepcopy(config), device, state)
+        paint(style)
         views.append(view_of(style, baked=True))
         gradients.append(style_gradients(style))
     found["gradient_distance"] = float((gradients[1] - gradients[0]).norm() / gradients[0].norm())
