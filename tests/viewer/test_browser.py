@@ -104,14 +104,14 @@ class Page:
     def scene_unlike(self, *others: np.ndarray) -> np.ndarray:
         """The still picture, once it shows what none of these do; a busy machine takes its time to draw it."""
         end = time.monotonic() + PATIENCE
-        while min(difference(picture := self.scene(), other) for other in others) < 2:
+        while min(difference(picture := self.scene(), other) for other in others) < ANOTHER:
             assert time.monotonic() < end, "the picture doesn't change"
         return picture
 
     def scene_like(self, other: np.ndarray) -> None:
         """Waits until the still picture is this one."""
         end = time.monotonic() + PATIENCE
-        while (apart := difference(self.scene(), other)) >= 2:
+        while (apart := difference(self.scene(), other)) >= ANOTHER:
             assert time.monotonic() < end, f"the picture doesn't come back: it is {apart:.1f} away"
 
     def _is_still(self) -> bool:
@@ -123,9 +123,17 @@ class Page:
         return self.tab.screenshot()[60:420, 10:430].astype(float)
 
 
+ANOTHER = 4.0
+"""A difference from which on a picture is another one: those here are 20 and more apart, and one that comes back 0.2."""
+BLOCK = 10
+"""Pixels are compared in squares of so many a side: a browser that is short of time draws five of them as one."""
+
+
 def difference(first: np.ndarray, second: np.ndarray) -> float:
-    """Mean difference of pixels, of 255."""
-    return float(np.abs(first - second).mean())
+    """Mean difference of squares, of 255."""
+    height, width = (length // BLOCK * BLOCK for length in first.shape[:2])
+    apart = (first - second)[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK, 3)
+    return float(np.abs(apart.mean(axis=(1, 3))).mean())
 
 
 @pytest.fixture(scope="module")
