@@ -52,6 +52,7 @@ def picture(run: Path) -> Dict[str, torch.Tensor]:
     could_go_wrong="no start without CUDA; other rays, other jitter, grids that differ; names that no reader knows",
     must_hold="the weights of one process with the same settings, to 0.01% of what 6 steps have moved them",
 )
+@pytest.mark.slow
 def test_stage_1_on_two_processes_is_stage_1_on_one(llff_scene, tmp_path):
     whole = ["--pipeline.model.thinning", "0"]  # else each process draws which of its samples to leave out
     still = ["--max-num-iterations", "1", "--optimizers.fields.optimizer.lr", "1e-12"]
@@ -71,6 +72,7 @@ def test_stage_1_on_two_processes_is_stage_1_on_one(llff_scene, tmp_path):
     could_go_wrong="gradients of half a picture, or half the gradient; different starts; each process its own view",
     must_hold="the picture of one process with the same settings, to 0.2% of what stylising has changed in it",
 )
+@pytest.mark.slow
 def test_stage_2_on_two_processes_is_stage_2_on_one(runs, llff_scene, painting, tmp_path):
     # Weights alone say less: Adam moves one whose gradient is only rounding by as much as any other.
     flags = ["--style-image", str(painting), "--coarse-run", str(runs.coarse), *TINY_STYLE, *COMMON]

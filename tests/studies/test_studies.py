@@ -168,6 +168,7 @@ def painted_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paper_studies, "transfer_frames", lambda frames, painting: [1.0 - frame for frame in frames])
 
 
+@pytest.mark.slow
 def test_compare_trains_what_is_missing_measures_each_row_and_writes_the_page(
     llff_scene: Path,
     painting: Path,

@@ -124,7 +124,7 @@ class Page:
 
 
 ANOTHER = 4.0
-"""A difference from which on a picture is another one: those here are 20 and more apart, and one that comes back 0.2."""
+"""A difference from which on a picture is another one: those here are 20 and more apart; one that comes back, 0.2."""
 BLOCK = 10
 """Pixels are compared in squares of so many a side: a browser that is short of time draws five of them as one."""
 
