@@ -322,6 +322,7 @@ import time
 from sparsestyle_ns.utils import interrupts
 
 interrupts.end_on_ctrl_c()
+interrupts.mind_swallowed_presses()
 try:
     print("here", flush=True)
     time.sleep(60)

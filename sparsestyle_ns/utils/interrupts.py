@@ -64,6 +64,23 @@ def end_on_ctrl_c() -> None:
         atexit.register(lambda: None if _pressed_at is None else _say(SENTENCE))  # once all has come to its end
 
 
+def mind_swallowed_presses() -> None:
+    """Has Ctrl-C pressed again where the C code of a library has swallowed it, and the viewer waits for ever.
+
+    The thread that looks after it is there before, as a signal's handler that starts one may wait for itself.
+    """
+
+    def look() -> None:
+        while True:
+            time.sleep(SECONDS_UNTIL_MINDED)
+            frame = sys._current_frames().get(threading.main_thread().ident)
+            waits = frame is not None and frame.f_globals.get("__name__") == VIEWER_MODULE
+            if waits and _pressed_at is not None and time.monotonic() - _pressed_at > SECONDS_UNTIL_MINDED:
+                _press_again()
+
+    threading.Thread(target=look, name="Ctrl-C", daemon=True).start()
+
+
 @contextmanager
 def ended_by_ctrl_c() -> Iterator[None]:
     """Ctrl-C within it ends the process as in one that is guarded, also where none is, as where Python calls it."""
@@ -107,6 +124,8 @@ def guard_nerfstudio(methods: Tuple[str, ...]) -> None:
     is_asked_for = command == "train" and any(word.startswith(methods) for word in sys.argv[1:])
     if is_asked_for or is_run:
         end_on_ctrl_c()
+        if command == "viewer":
+            mind_swallowed_presses()
 
 
 def _refuse_missing_run(methods: Tuple[str, ...]) -> None:
@@ -174,7 +193,6 @@ def _on_press(number: int, frame: Optional[FrameType]) -> None:
     global _pressed_at
     if _pressed_at is None:
         _pressed_at = time.monotonic()
-        threading.Thread(target=_mind_swallowed, daemon=True).start()
         raise StoppedByCtrlC
     if time.monotonic() - _pressed_at > SECONDS_OF_GRACE:
         for leftover in _leftovers:
@@ -182,17 +200,6 @@ def _on_press(number: int, frame: Optional[FrameType]) -> None:
                 leftover()
         _say(SENTENCE)
         os._exit(STATUS)
-
-
-def _mind_swallowed() -> None:
-    """Makes a press again that the C code of some library has swallowed: nerfstudio's viewer would wait for ever."""
-    while True:
-        time.sleep(SECONDS_UNTIL_MINDED)
-        frame = sys._current_frames().get(threading.main_thread().ident)
-        if frame is None:
-            return
-        if frame.f_globals.get("__name__") == VIEWER_MODULE:
-            return _press_again()
 
 
 def _on_unraisable(before: Callable[[Any], None], lost: Any) -> None:
