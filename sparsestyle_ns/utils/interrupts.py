@@ -26,6 +26,7 @@ SECONDS_OF_GRACE = 5.0
 SECONDS_UNTIL_AGAIN = 0.1
 """After which a press that was lost is made again: what lost it has come to its end by then."""
 SECONDS_UNTIL_MINDED = 1.0
+"""After which a press that has ended nothing is made again."""
 VIEWER_MODULE = "nerfstudio.scripts.viewer.run_viewer"
 """Whose main thread sleeps until Ctrl-C."""
 NS_COMMANDS = {"train": "train", "render": "render", "eval": "eval", "exporter": "export", "run_viewer": "viewer"}

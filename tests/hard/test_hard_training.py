@@ -231,51 +231,56 @@ def test_the_density_grid_remembers_nothing_that_isnt_finite():
 
 # ----------------------------------------------------------------------------------------------------- many steps
 
-STEPS = {"coarse-fewshot": 300, "hier-style": 1000}
+STEPS = pytest.mark.parametrize("steps", [300, pytest.param(1000, marks=pytest.mark.slow)])
 QUIET = ["--steps-per-save", "2000", "--steps-per-eval-image", "0"]
 QUIET += ["--logging.steps-per-log", "500"]
 
 
-def train_many_steps(capsys: pytest.CaptureFixture, method: str, scene: Path, outputs: Path, *flags: str) -> None:
-    ns_train(method, scene, outputs, *flags, *QUIET, "--max-num-iterations", str(STEPS[method]))
+def train_many_steps(
+    steps: int, capsys: pytest.CaptureFixture, method: str, scene: Path, outputs: Path, *flags: str
+) -> None:
+    ns_train(method, scene, outputs, *flags, *QUIET, "--max-num-iterations", str(steps))
     checkpoint = checkpoint_of(outputs, method)
-    assert checkpoint["step"] == STEPS[method] - 1
+    assert checkpoint["step"] == steps - 1
     assert_finite(checkpoint)
     assert "Steps skipped" not in " ".join(capsys.readouterr().out.split())
 
 
 @hard_case(
     "training",
-    case="300 steps of stage 1 at ten times the default learning rate",
+    case="300 and 1,000 steps of stage 1 at ten times the default learning rate",
     could_go_wrong="densities and activations run away until something overflows",
     must_hold="no step is skipped; parameters, Adam's state and grid are finite",
 )
-def test_stage_1_stays_finite_at_ten_times_the_learning_rate(llff_scene, tmp_path, capsys):
+@STEPS
+def test_stage_1_stays_finite_at_ten_times_the_learning_rate(llff_scene, steps, tmp_path, capsys):
     rate = ["--optimizers.fields.optimizer.lr", "5e-3"]
-    train_many_steps(capsys, "coarse-fewshot", llff_scene, tmp_path, *TINY, *rate)
+    train_many_steps(steps, capsys, "coarse-fewshot", llff_scene, tmp_path, *TINY, *rate)
 
 
 @hard_case(
     "training",
-    case="300 steps of stage 1 with every regulariser on, at a hundred times its weight, and view directions",
+    case="300 and 1,000 steps of stage 1 with every regulariser on, at a hundred times its weight, and view directions",
     could_go_wrong="a loss without bounds meets densities at their cap",
     must_hold="no step is skipped; everything is finite",
 )
-def test_stage_1_stays_finite_with_every_regulariser(llff_scene, tmp_path, capsys):
+@STEPS
+def test_stage_1_stays_finite_with_every_regulariser(llff_scene, steps, tmp_path, capsys):
     model = {"distortion-weight": "1", "distortion-start": "0", "occlusion-weight": "10", "frequency-reveal": "0.5"}
     flags = [part for name, value in model.items() for part in (f"--pipeline.model.{name}", value)]
     flags += ["--pipeline.model.coarse-field.direction-levels", "4"]
-    train_many_steps(capsys, "coarse-fewshot", llff_scene, tmp_path, *TINY, *flags)
+    train_many_steps(steps, capsys, "coarse-fewshot", llff_scene, tmp_path, *TINY, *flags)
 
 
 @hard_case(
     "training",
-    case="300 steps of stage 1 from a field at its densest, and from an empty one",
+    case="300 and 1,000 steps of stage 1 from a field at its densest, and from an empty one",
     could_go_wrong="the first sample hides all others, or no ray has any weight: gradients of 0 / 0",
     must_hold="no step is skipped; everything is finite",
 )
 @pytest.mark.parametrize("activation, bias", [("exp", "40"), ("exp", "-40"), ("softplus", "40")])
-def test_stage_1_stays_finite_from_opaque_and_empty_fields(llff_scene, tmp_path, capsys, activation, bias):
+@STEPS
+def test_stage_1_stays_finite_from_opaque_and_empty_fields(llff_scene, steps, tmp_path, capsys, activation, bias):
     flags = ["--pipeline.model.coarse-field.density-activation", activation]
     flags += [
         "--pipeline.model.coarse-field.density-bias",
@@ -283,18 +288,19 @@ def test_stage_1_stays_finite_from_opaque_and_empty_fields(llff_scene, tmp_path,
         "--pipeline.datamanager.train-num-rays-per-batch",
         "32",
     ]
-    train_many_steps(capsys, "coarse-fewshot", llff_scene, tmp_path, *TINY, *flags)
+    train_many_steps(steps, capsys, "coarse-fewshot", llff_scene, tmp_path, *TINY, *flags)
 
 
 @hard_case(
     "training",
-    case="300 steps of stage 1 with one ray a step and one sample on it",
+    case="300 and 1,000 steps of stage 1 with one ray a step and one sample on it",
     could_go_wrong="histograms and means over a single thing: 0 / 0",
     must_hold="no step is skipped; everything is finite",
 )
-def test_stage_1_stays_finite_with_one_ray_and_one_sample(llff_scene, tmp_path, capsys):
+@STEPS
+def test_stage_1_stays_finite_with_one_ray_and_one_sample(llff_scene, steps, tmp_path, capsys):
     flags = ["--pipeline.model.num-samples", "1", "--pipeline.datamanager.train-num-rays-per-batch", "1"]
-    train_many_steps(capsys, "coarse-fewshot", llff_scene, tmp_path, *TINY, *flags)
+    train_many_steps(steps, capsys, "coarse-fewshot", llff_scene, tmp_path, *TINY, *flags)
 
 
 @pytest.fixture()
@@ -310,12 +316,13 @@ def one_colour_scene(llff_scene: Path, tmp_path: Path) -> Path:
 
 @hard_case(
     "training",
-    case="300 steps of stage 1 on photos of a single colour",
+    case="300 and 1,000 steps of stage 1 on photos of a single colour",
     could_go_wrong="an error of 0: the PSNR is infinite, gradients vanish, Adam divides by its ε",
     must_hold="no step is skipped; everything is finite",
 )
-def test_stage_1_stays_finite_on_photos_of_one_colour(one_colour_scene, tmp_path, capsys):
-    train_many_steps(capsys, "coarse-fewshot", one_colour_scene, tmp_path / "outputs", *TINY)
+@STEPS
+def test_stage_1_stays_finite_on_photos_of_one_colour(one_colour_scene, steps, tmp_path, capsys):
+    train_many_steps(steps, capsys, "coarse-fewshot", one_colour_scene, tmp_path / "outputs", *TINY)
 
 
 SMALL_STYLE = [*TINY_STYLE, "--pipeline.feature-side", "32", "--pipeline.warm-start-steps", "0"]
@@ -334,7 +341,7 @@ def style_flags(runs: SimpleNamespace, painting: Path) -> List[str]:
 @pytest.mark.slow
 def test_stage_2_stays_finite_when_the_density_leaps(runs, llff_scene, painting, tmp_path, capsys):
     flags = ["--optimizers.fields.optimizer.lr", "5e-2", "--pipeline.model.residual-density-scale", "1000"]
-    train_many_steps(capsys, "hier-style", llff_scene, tmp_path, *style_flags(runs, painting), *flags)
+    train_many_steps(1000, capsys, "hier-style", llff_scene, tmp_path, *style_flags(runs, painting), *flags)
 
 
 @hard_case(
@@ -348,4 +355,4 @@ def test_stage_2_stays_finite_when_the_density_leaps(runs, llff_scene, painting,
 def test_stage_2_stays_finite_with_a_painting_of_one_colour(runs, llff_scene, tmp_path, capsys, weight):
     Image.fromarray(np.full((16, 16, 3), 77, np.uint8)).save(tmp_path / "one.png")
     flags = [*style_flags(runs, tmp_path / "one.png"), "--pipeline.loss-weights.content", weight]
-    train_many_steps(capsys, "hier-style", llff_scene, tmp_path, *flags)
+    train_many_steps(1000, capsys, "hier-style", llff_scene, tmp_path, *flags)

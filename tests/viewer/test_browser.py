@@ -123,10 +123,10 @@ class Page:
         return self.tab.screenshot()[60:420, 10:430].astype(float)
 
 
-ANOTHER = 4.0
+ANOTHER = 2.0
 """A difference from which on a picture is another one: those here are 20 and more apart; one that comes back, 0.2."""
 BLOCK = 10
-"""Pixels are compared in squares of so many a side: a browser that is short of time draws five of them as one."""
+"""Pixels are compared in squares of so many a side: while a browser is short of time its picture is a coarser one."""
 
 
 def difference(first: np.ndarray, second: np.ndarray) -> float:
