@@ -1,6 +1,7 @@
 """How nerfstudio's own part of the viewer is made to fit a scene of a few photos."""
 
 import math
+from threading import Thread
 from typing import Any, Callable, List
 
 from nerfstudio.cameras.cameras import Cameras
@@ -76,3 +77,11 @@ def make_rays_once() -> None:
         return camera
 
     render_state_machine.get_camera = viewer_camera
+
+
+def end_drawing(viewer: Viewer) -> List[Thread]:
+    """Ends the threads that draw pictures, those that are being drawn too; returns them, which may take a while."""
+    threads = list(viewer.render_statemachines.values())
+    for thread in threads:
+        thread.running, thread.interrupt_render_flag = False, True
+    return threads

@@ -22,7 +22,14 @@ from sparsestyle_ns.rendering.mixing import Mix
 from sparsestyle_ns.runs.checkpoints import CheckpointNotes
 from sparsestyle_ns.runs.scene_record import find_thumbnail
 from sparsestyle_ns.utils.files import free_name
-from sparsestyle_ns.viewer.adjustments import begin_at_central_photo, hide_frustums, keep_outputs, make_rays_once
+from sparsestyle_ns.utils.threads import wait_for_end
+from sparsestyle_ns.viewer.adjustments import (
+    begin_at_central_photo,
+    end_drawing,
+    hide_frustums,
+    keep_outputs,
+    make_rays_once,
+)
 from sparsestyle_ns.viewer.baking import Baker
 from sparsestyle_ns.viewer.restyling_controls import Pace, RestylingControls, losses_text
 from sparsestyle_ns.viewer.splat_controls import SplatControls
@@ -118,9 +125,8 @@ class StylePanel(ViewerControl):
             self.baker.ending.set()
         if self.restyling.is_busy:
             CONSOLE.print("The restyling is being stopped; Ctrl-C ends it at once.")
-        for thread in (self.baker, self.restyling.thread):
-            if thread is not None:
-                thread.join(SECONDS_TO_END)
+        own = [thread for thread in (self.baker, self.restyling.thread) if thread is not None]
+        wait_for_end([*own, *end_drawing(self.viewer)], SECONDS_TO_END)
 
     def _lock(self) -> AbstractContextManager:
         """The lock that iterations of training and the viewer's pictures take turns by."""
@@ -237,3 +243,4 @@ class EffectsPanel(ViewerControl):
     def _setup(self, viewer: Viewer) -> None:
         super()._setup(viewer)
         add_effects(viewer, self.pipeline)
+        atexit.register(lambda: wait_for_end(end_drawing(viewer), SECONDS_TO_END))

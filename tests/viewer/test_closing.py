@@ -5,7 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-SCRIPT = """
+import pytest
+
+OPENING = """
 import sys, threading, time
 from pathlib import Path
 
@@ -18,19 +20,43 @@ from sparsestyle_ns.engine.loading import load_run
 run, painting = Path(sys.argv[1]), sys.argv[2]
 torch.set_num_threads(2)
 _, pipeline, _ = load_run(run / "config.yml")
-Viewer(ViewerConfig(websocket_host="127.0.0.1"), run / "viewer.txt", run, pipeline, train_lock=threading.Lock())
+config = ViewerConfig(websocket_host="127.0.0.1")
+viewer = Viewer(config, run / "viewer.txt", run, pipeline, train_lock=threading.Lock())
 panel = pipeline.panel
+"""
+CLOSING = """
+print("closing")
+raise KeyboardInterrupt  # as in ns-viewer's main thread on Ctrl-C
+"""
+RESTYLING = """
 panel.restyling.iterations.value, panel.restyling.path.value = 100000, painting
 panel.restyling.restyle_path()
 while "Iteration 2" not in panel.restyling.message.content:
     time.sleep(0.01)
-print("closing")
-raise KeyboardInterrupt  # as in ns-viewer's main thread on Ctrl-C
+"""
+DRAWING = """
+from types import SimpleNamespace
+import viser
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+camera = SimpleNamespace(position=(0.0, 0.0, 1.0), wxyz=(1.0, 0.0, 0.0, 0.0), fov=0.8, aspect=1.5)
+camera.on_update = lambda function: function
+client = SimpleNamespace(client_id=0, camera=camera)
+viewer.ready, model, began = True, pipeline.model, threading.Event()
+def outputs(*_, **__):
+    began.set()
+    while True:
+        torch.randn(1000, 1000) @ torch.randn(1000, 1000)
+model.get_outputs_for_camera = outputs
+viewer.handle_new_client(client)
+began.wait()
 """
 
 
-def test_ctrl_c_while_restyling_ends_the_process_without_a_crash(patterned_run: Path, painting: Path) -> None:
-    command = [sys.executable, "-c", SCRIPT, str(patterned_run), str(painting)]
+@pytest.mark.parametrize("work", [RESTYLING, DRAWING], ids=["restyling", "drawing a picture"])
+def test_ctrl_c_while_threads_work_ends_the_process_without_a_crash(
+    work: str, patterned_run: Path, painting: Path
+) -> None:
+    command = [sys.executable, "-c", OPENING + work + CLOSING, str(patterned_run), str(painting)]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=240)
     assert "closing" in ended.stdout, ended.stderr
     # Python's own end after Ctrl-C; where a thread is left in the middle of torch, C++ aborts the process.
