@@ -1,7 +1,7 @@
 #version 300 es
 // One ray a pixel through the voxels of a stylised scene, with the steps of the exact render. core/spaces.py and
 // rendering/render.py do the same in Python, rendering/mixing.py what lies between the fields, export/voxel_grid.py all
-// of it with these voxels.
+// of it with these voxels. With OF_TILES, instead, how far all rays of a tile of pixels surely meet nothing.
 precision highp float;
 precision highp int;
 precision highp sampler3D;
@@ -9,16 +9,19 @@ precision highp sampler3D;
 #define NDC 0
 #define BOX 1
 #define CONTRACTED 2
-// renderer.js defines SPACE, UNBOUNDED, STYLES (how many are seen) and HAS_COARSE, because a processor that stands in for
-// a graphics card goes through both sides of every `if`.
+// renderer.js defines SPACE, UNBOUNDED, STYLES (how many are seen), HAS_COARSE, OF_TILES and TILE (a tile's side in
+// pixels), because a processor that stands in for a graphics card goes through both sides of every `if`.
 
 const float ENOUGH = 0.02;  // light behind which a ray ends; what is left of it gets the last colour
 const float MAX_OPTICAL_DEPTH = 80.0;
 const float MIN_FORWARD = 1e-6;
 const float MAX_DISTANCE = 1e4;
+const float LEAST_STRIDE = 0.25;  // of a step: with less, the rays of a tile have come to something
+const float CONTRACTION = 2.0 / 3.0;  // the most by which it stretches a small length of its unit, in the maximum norm
 
 uniform sampler3D u_style, u_other, u_coarse;  // rgb: colour, a: code of the density; z is the first axis
 uniform sampler3D u_clearance;                 // how many cells away the nearest is that holds anything, of 255
+uniform sampler2D u_free;                      // what the tiles have found: a share of the way, of 65535, in two bytes
 uniform float u_strength, u_density_share, u_blend;
 uniform float u_divider;                       // left of it, in pixels, is the coarse field
 uniform int u_num_steps;
@@ -38,6 +41,10 @@ out vec4 color;
 // A segment in field coordinates, start + s extent, or for a contracted space the ray in its unit.
 vec3 start, extent;
 
+float largest(vec3 values) {
+    return max(values.x, max(values.y, values.z));
+}
+
 #if SPACE == NDC
 bool enter(vec3 origin, vec3 direction) {
     if (direction.z >= -MIN_FORWARD) return false;
@@ -55,17 +62,27 @@ bool enter(vec3 origin, vec3 direction) {
 }
 
 #elif SPACE == BOX
+// Distances from a camera between which the whole box lies, and those between which a ray is in it.
+vec2 around(vec3 origin) {
+    float away = distance(origin, 0.5 * (u_minimum + u_maximum)), reach = 0.5 * distance(u_minimum, u_maximum);
+    return max(vec2(away - reach, away + reach), u_near);
+}
+
+vec2 within;
+
 bool enter(vec3 origin, vec3 direction) {
+#if OF_TILES
+    within = around(origin);
+#else
     vec3 safe = mix(direction, vec3(1e-30), lessThan(abs(direction), vec3(1e-30)));
     vec3 first = (u_minimum - origin) / safe, second = (u_maximum - origin) / safe;
     vec3 low = min(first, second), high = max(first, second);
-    float near = max(max(low.x, max(low.y, low.z)), u_near);
-    float far = min(high.x, min(high.y, high.z));
-    vec3 size = u_maximum - u_minimum;
-    float scale = 2.0 / max(size.x, max(size.y, size.z));
-    start = (origin + near * direction - 0.5 * (u_minimum + u_maximum)) * scale;
-    extent = (far - near) * direction * scale;
-    return far > near;
+    within = vec2(max(largest(low), u_near), min(high.x, min(high.y, high.z)));
+#endif
+    float scale = 2.0 / largest(u_maximum - u_minimum);
+    start = (origin + within.x * direction - 0.5 * (u_minimum + u_maximum)) * scale;
+    extent = (within.y - within.x) * direction * scale;
+    return within.y > within.x;
 }
 
 #else
@@ -81,11 +98,15 @@ float spacing(float distance) {
     return distance < 1.0 ? 0.5 * distance : 1.0 - 0.5 / distance;
 }
 
-vec3 point(float s) {
+float distance_at(float s) {
     float spaced = mix(spacing(u_near), spacing(MAX_DISTANCE), s);
-    float distance = spaced < 0.5 ? 2.0 * spaced : 0.5 / max(1.0 - spaced, 0.5 / MAX_DISTANCE);
-    vec3 position = start + distance * extent, size = abs(position);
-    float norm = max(size.x, max(size.y, size.z));
+    return spaced < 0.5 ? 2.0 * spaced : 0.5 / max(1.0 - spaced, 0.5 / MAX_DISTANCE);
+}
+
+vec3 point(float s) {
+    float distance = distance_at(s);
+    vec3 position = start + distance * extent;
+    float norm = largest(abs(position));
     return position * (norm < 1.0 ? 0.5 : (1.0 - 0.5 / norm) / norm);
 }
 #else
@@ -120,6 +141,81 @@ vec4 mixture(vec3 share, float strength, float density_share) {
 #endif
 }
 
+vec3 direction_of(vec2 pixel) {
+    vec3 seen = vec3((pixel.x - u_center.x) / u_focal.x, (u_center.y - pixel.y) / u_focal.y, -1.0);
+    return normalize(mat3(u_pose) * seen);
+}
+
+ivec3 cell_of(vec3 share) {
+    vec3 cells = vec3(textureSize(u_clearance, 0));
+    return ivec3(min(share * cells, cells - 1.0));
+}
+
+#if OF_TILES
+// How far in field coordinates the rays of a tile are from the one in its middle at most, at a share s of the way.
+float spread_start, spread_extent;
+
+float spread(float s) {
+#if SPACE == CONTRACTED
+    float distance = distance_at(s), apart = distance * spread_extent;
+    float norm = largest(abs(start + distance * extent)) - apart;
+    return apart * min(CONTRACTION, 2.0 / max(norm, 1e-6));
+#else
+    return spread_start + s * spread_extent;
+#endif
+}
+
+// The share of the way, in the middle of a tile, after which its rays may meet something.
+float free_way(float step) {
+    float cell = 2.0 / float(textureSize(u_clearance, 0).x), s = 0.0;
+    while (s < 1.0) {
+        vec3 position = point(s), nearest = clamp(position, -1.0, 1.0);
+        float clear = floor(255.0 * texelFetch(u_clearance, cell_of((0.5 * nearest + 0.5).zyx), 0).r + 0.5);
+        float radius = max(0.999 * (clear - 1.0) * cell, largest(abs(position - nearest)));
+#if SPACE == CONTRACTED
+        bool is_free = largest(abs(point(s + step) - position)) + spread(s + step) < radius;
+        float stride = is_free ? step : 0.0;
+#else
+        float stride = (radius - spread(s)) / (largest(abs(extent)) + spread_extent);
+#endif
+        if (stride < LEAST_STRIDE * step) break;
+        s += stride;
+    }
+    return min(s, 1.0);
+}
+
+void main() {
+    float side = float(TILE);
+    vec2 low = side * floor(gl_FragCoord.xy);
+    vec3 origin = u_pose[3].xyz, starts[5], extents[5];
+    bool is_seen = true;
+    for (int i = 0; i < 5; i++) {
+        vec2 at = i == 4 ? vec2(0.5) : vec2(i & 1, i >> 1);
+        is_seen = enter(origin, direction_of(vec2(low.x + side * at.x, u_size.y - low.y - side * at.y))) && is_seen;
+        starts[i] = start;
+        extents[i] = extent;
+    }
+    spread_start = spread_extent = 0.0;
+    for (int i = 0; i < 4; i++) {
+        spread_start = max(spread_start, largest(abs(starts[i] - start)));
+        spread_extent = max(spread_extent, largest(abs(extents[i] - extent)));
+    }
+    float way = floor(65535.0 * (is_seen ? free_way(1.0 / float(u_num_steps)) : 0.0));
+    color = vec4(floor(way / 256.0) / 255.0, mod(way, 256.0) / 255.0, 0.0, 1.0);
+}
+
+#else
+// The step before which the rays of this pixel's tile meet nothing.
+int first_step() {
+    vec2 bytes = floor(255.0 * texelFetch(u_free, ivec2(gl_FragCoord.xy) / TILE, 0).rg + 0.5);
+    float way = dot(bytes, vec2(256.0, 1.0)) / 65535.0;
+#if SPACE == BOX
+    vec2 all = around(u_pose[3].xyz);
+    way = (mix(all.x, all.y, way) - within.x) / (within.y - within.x);
+#endif
+    return int(float(u_num_steps) * clamp(way, 0.0, 1.0));
+}
+
 // The middle of a step, as a share of the cube's sides in the textures' order.
 vec3 middle(int i, float step) {
     return clamp(0.5 * point((float(i) + 0.5) * step) + 0.5, 0.0, 1.0).zyx;
@@ -127,23 +223,21 @@ vec3 middle(int i, float step) {
 
 void main() {
     vec2 pixel = vec2(gl_FragCoord.x, u_size.y - gl_FragCoord.y);
-    vec3 seen = vec3((pixel.x - u_center.x) / u_focal.x, (u_center.y - pixel.y) / u_focal.y, -1.0);
-    vec3 direction = normalize(mat3(u_pose) * seen);
     bool before = pixel.x < u_divider;
     float strength = before ? 0.0 : u_strength, density_share = before ? 0.0 : u_density_share;
     vec3 sum = vec3(0.0);
     float light = 1.0;
-    if (enter(u_pose[3].xyz, direction)) {
+    if (enter(u_pose[3].xyz, direction_of(pixel))) {
         float step = 1.0 / float(u_num_steps), length_ = length(extent) * step;
-        vec3 cells = vec3(textureSize(u_clearance, 0));
+        float cells = float(textureSize(u_clearance, 0).x);
         // Steps that surely lead out of no more than one cell; how a contraction bends them, nobody knows.
-        float steps_a_cell = SPACE == CONTRACTED ? 0.0 : 1.998 / (cells.x * length_ + 1e-6);
+        float steps_a_cell = SPACE == CONTRACTED ? 0.0 : 1.998 / (cells * length_ + 1e-6);
         int end = UNBOUNDED ? u_num_steps - 1 : u_num_steps;  // the last step of an unbounded ray always counts
         bool inside = false;
-        for (int i = 0; i < u_num_steps; i++) {
+        for (int i = min(first_step(), end); i < u_num_steps; i++) {
             vec3 share = middle(i, step);
             while (!inside && i < end) {
-                float clear = 255.0 * texelFetch(u_clearance, ivec3(min(share * cells, cells - 1.0)), 0).r;
+                float clear = 255.0 * texelFetch(u_clearance, cell_of(share), 0).r;
                 if (clear < 0.5) break;
                 i = min(i + 1 + int((floor(clear + 0.5) - 1.0) * steps_a_cell), end);
                 share = middle(i, step);
@@ -167,3 +261,4 @@ void main() {
     }
     color = vec4(sum + light * u_background, 1.0);
 }
+#endif

@@ -1,4 +1,7 @@
-// Draws the voxels with WebGL2: one ray a pixel, by raymarch.frag.
+// Draws the voxels with WebGL2 by raymarch.frag: a cone for each tile of pixels, then a ray a pixel from where it ends.
+
+const TILE = 8;
+const TILES_UNIT = 4;
 
 function compile(gl, type, source) {
   const shader = gl.createShader(type);
@@ -46,10 +49,35 @@ function makeTextures(gl, voxels) {
   voxels.styles.forEach((texels, i) => makeTexture(gl, 2 + i, side, gl.RGBA8, gl.RGBA, gl.LINEAR, texels));
 }
 
+/** A function that draws into a texture of a pixel for each tile, behind the others' units, and then on the canvas. */
+function makeTiles(gl) {
+  const framebuffer = gl.createFramebuffer();
+  gl.activeTexture(gl.TEXTURE0 + TILES_UNIT);
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+  gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+  gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+  let size = [0, 0];
+  return (width, height, draw) => {
+    const needed = [width, height].map((side) => Math.ceil(side / TILE));
+    if (String(needed) !== String(size)) {
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, ...needed, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
+      size = needed;
+    }
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.viewport(0, 0, ...size);
+    draw(true);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, width, height);
+    draw(false);
+  };
+}
+
 /** Tells the shader what stays as it is. */
 function describeScene(gl, at) {
   const { space, density } = scene;
-  ["u_clearance", "u_coarse", "u_style", "u_other"].forEach((name, unit) => gl.uniform1i(at(name), unit));
+  ["u_clearance", "u_coarse", "u_style", "u_other", "u_free"].forEach((name, unit) => gl.uniform1i(at(name), unit));
   const toTexels = ({ resolution }) => [resolution / (resolution + 1), 0.5 / (resolution + 1)];
   gl.uniform2fv(at("u_style_texels"), toTexels(scene.styles[0]));
   gl.uniform2fv(at("u_coarse_texels"), toTexels(scene.coarse));
@@ -67,19 +95,20 @@ function describeScene(gl, at) {
 
 const CHANGING = ["u_num_steps", "u_pose", "u_focal", "u_center", "u_size", "u_strength", "u_density_share", "u_blend", "u_divider"];
 
-/** What raymarch.frag has to do for a look. */
-function neededFor({ strength, geometry, blend, divider }) {
+/** What raymarch.frag has to do for a look, and for tiles, which all looks share. */
+function neededFor({ strength, geometry, blend, divider }, ofTiles) {
   const styles = strength === 0 ? 0 : blend === 0 ? 1 : 2;
   const hasCoarse = divider !== null || strength * geometry < 1;
   const { kind, unbounded } = scene.space;
-  return { SPACE: kind.toUpperCase(), UNBOUNDED: unbounded, STYLES: styles, HAS_COARSE: Number(hasCoarse) };
+  const always = { SPACE: kind.toUpperCase(), UNBOUNDED: unbounded, OF_TILES: Number(ofTiles), TILE };
+  return ofTiles ? { ...always, STYLES: 0, HAS_COARSE: 0 } : { ...always, STYLES: styles, HAS_COARSE: Number(hasCoarse) };
 }
 
-/** A function that chooses the program for a look, and returns the places of what changes. */
+/** A function that chooses the program for a look, or for tiles, and returns the places of what changes. */
 function makeChooser(gl) {
   const known = new Map();
-  return (look) => {
-    const defined = neededFor(look);
+  return (look, ofTiles) => {
+    const defined = neededFor(look, ofTiles);
     const key = JSON.stringify(defined);
     if (known.has(key)) {
       gl.useProgram(known.get(key).program);
@@ -97,28 +126,29 @@ function makeChooser(gl) {
 /** A function that draws what a camera sees, in a look, with a share of the steps, and returns the seconds it took. */
 function makeRenderer(gl, voxels) {
   makeTextures(gl, voxels);
-  const choose = makeChooser(gl);
+  const [choose, drawTilesFirst] = [makeChooser(gl), makeTiles(gl)];
   const pixel = new Uint8Array(4);
   return ({ pose, camera }, look, steps, width, height) => {
     const start = performance.now();
-    const places = choose(look);
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    gl.viewport(0, 0, width, height);
     const scale = Math.min(width / camera.width, height / camera.height); // the whole photo fits in
-    gl.uniform2f(places.u_focal, scale * camera.fx, scale * camera.fy);
-    gl.uniform2f(
-      places.u_center,
-      0.5 * width + scale * (camera.cx - 0.5 * camera.width),
-      0.5 * height + scale * (camera.cy - 0.5 * camera.height),
-    );
-    gl.uniform2f(places.u_size, width, height);
-    gl.uniformMatrix4fv(places.u_pose, false, toColumns(pose));
-    gl.uniform1i(places.u_num_steps, Math.round(steps * scene.num_steps));
-    gl.uniform1f(places.u_strength, look.strength);
-    gl.uniform1f(places.u_density_share, look.strength * look.geometry);
-    gl.uniform1f(places.u_blend, look.blend);
-    gl.uniform1f(places.u_divider, look.divider === null ? -1 : look.divider * width);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    drawTilesFirst(width, height, (ofTiles) => {
+      const places = choose(look, ofTiles);
+      gl.uniform2f(places.u_focal, scale * camera.fx, scale * camera.fy);
+      gl.uniform2f(
+        places.u_center,
+        0.5 * width + scale * (camera.cx - 0.5 * camera.width),
+        0.5 * height + scale * (camera.cy - 0.5 * camera.height),
+      );
+      gl.uniform2f(places.u_size, width, height);
+      gl.uniformMatrix4fv(places.u_pose, false, toColumns(pose));
+      gl.uniform1i(places.u_num_steps, Math.round(steps * scene.num_steps));
+      gl.uniform1f(places.u_strength, look.strength);
+      gl.uniform1f(places.u_density_share, look.strength * look.geometry);
+      gl.uniform1f(places.u_blend, look.blend);
+      gl.uniform1f(places.u_divider, look.divider === null ? -1 : look.divider * width);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    });
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); // waits for the picture
     return (performance.now() - start) / 1000;
   };

@@ -18,14 +18,16 @@ async function main() {
   const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
   if (!gl) throw new Error("This browser shows no WebGL2; turn on hardware acceleration, or use another browser.");
   canvas.addEventListener("webglcontextlost", () => {
-    message.textContent = "The graphics driver gave up on the scene; reload the page.";
-    document.body.dataset.state = "failed";
+    fail("The graphics driver gave up on the scene; reload the page.");
   });
   start(makeRenderer(gl, readVoxels(await unpack(document.getElementById("voxels").textContent))));
   message.textContent = "";
 }
 
-main().catch((error) => {
-  message.textContent = error.message;
+function fail(text) {
+  message.textContent = text;
   document.body.dataset.state = "failed";
-});
+}
+
+window.addEventListener("error", (event) => fail(event.message)); // while it draws
+main().catch((error) => fail(error.message));
