@@ -108,6 +108,22 @@ def put_walls(grid: VoxelGrid) -> None:
     grid.occupied[:] = True
 
 
+def put_specks(grid: VoxelGrid, cells: int) -> VoxelGrid:
+    """The grid with specks of a voxel each, far apart, in place of all else; cells of its own, as many a side."""
+    generator = torch.Generator().manual_seed(0)
+    occupied = torch.zeros(cells, cells, cells, dtype=torch.bool)
+    for voxels in (*grid.styles, grid.coarse):
+        voxels.known[:] = True
+        voxels.codes[..., 0] = EMPTY
+        side = len(voxels.codes)
+        at = torch.randint(1, side - 1, (40, 3), generator=generator)
+        voxels.codes[tuple(at.T)] = torch.tensor([250, 255, 200, 0], dtype=torch.uint8)
+        low, high = (((at + change) / (side - 1) * cells).long().clamp(0, cells - 1) for change in (-1, 1))
+        for first, last in zip(low.tolist(), high.tolist(), strict=True):
+            occupied[tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))] = True
+    return VoxelGrid(grid.styles, grid.coarse, occupied)
+
+
 def psnr(first, second) -> float:
     """In dB, of pictures in [0, 1]."""
     error = float((torch.as_tensor(first) - torch.as_tensor(second)).square().mean())

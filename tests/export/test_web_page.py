@@ -12,7 +12,7 @@ import torch
 from chromium import needs_chromium, open_tab
 from conftest import run_entrypoint
 from PIL import Image
-from small_scenes import HEIGHT, KINDS, WIDTH, look_ahead, psnr, scene
+from small_scenes import HEIGHT, KINDS, WIDTH, look_ahead, psnr, put_specks, scene
 from torchvision.transforms.functional import to_tensor
 
 from sparsestyle_ns.cli import main
@@ -134,6 +134,27 @@ def test_a_browser_shows_what_the_twin_in_torch_says(tab, tmp_path, kind):
         assert expected.std() > 0.05  # there is something to see
         # A screen has 256 shades: rounding alone leaves 59 dB. Cells' borders are where float32 puts them.
         assert psnr(shown(tab), expected) > 45
+
+
+@needs_chromium
+@pytest.mark.parametrize("kind", KINDS)
+def test_cones_that_find_where_rays_begin_pass_over_nothing(tab, tmp_path, kind):
+    small = scene(kind)
+    voxels = put_specks(small.voxels, 100)
+    page = build_page(voxels, [small], small.orbit).decode()
+    assert page.count("    draw(true);\n") == 1
+    without = page.replace("    draw(true);\n", "    gl.clear(gl.COLOR_BUFFER_BIT);\n")  # all rays begin at the camera
+    for view in range(3):
+        pictures = []
+        for name, text in (("with", page), ("without", without)):
+            path = tmp_path / f"{name}.html"
+            path.write_text(text)
+            tab.open(f"{path.as_uri()}#view={view}&size={WIDTH}x{HEIGHT}")
+            tab.wait_for(READY)
+            pictures.append(shown(tab))
+        assert pictures[0].std() > 0.02
+        assert psnr(*pictures) > 55
+        assert psnr(pictures[0], picture_of_voxels(voxels, small.model, small.cameras[view : view + 1])) > 40
 
 
 @needs_chromium

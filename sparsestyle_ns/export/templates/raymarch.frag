@@ -13,7 +13,7 @@ precision highp sampler3D;
 // pixels), because a processor that stands in for a graphics card goes through both sides of every `if`.
 
 const float ENOUGH = 0.02;  // light behind which a ray ends; what is left of it gets the last colour
-const float MAX_OPTICAL_DEPTH = 80.0;
+const float ENDLESS = 1e9;      // length of an unbounded ray's last step
 const float MIN_FORWARD = 1e-6;
 const float MAX_DISTANCE = 1e4;
 const float LEAST_STRIDE = 0.25;  // of a step: with less, the rays of a tile have come to something
@@ -31,7 +31,8 @@ uniform vec2 u_focal_over_half_size;     // NDC
 uniform vec2 u_depths;                   // NDC: t' of the nearest and of the farthest thing
 uniform float u_near;                    // in world units; contracted: in multiples of u_unit
 uniform float u_unit;                    // contracted: the length in the world that isn't bent
-uniform float u_density_unit, u_density_step, u_rounding;
+uniform float u_density_unit, u_least_density; // in bits: what light is halved by; less than the latter is rounding
+uniform vec2 u_density_bits;             // of a code: factor and offset
 uniform vec3 u_background;
 uniform mat4 u_pose;                     // camera to world
 uniform vec2 u_focal, u_center, u_size;  // in pixels; the centre from the top left
@@ -116,8 +117,7 @@ vec3 point(float s) {
 #endif
 
 float density_of(float code) {
-    float steps = 255.0 * code - 1.0;
-    return steps > u_rounding ? u_density_unit * (exp(u_density_step * steps) - 1.0) : 0.0;
+    return max(u_density_unit * (exp2(u_density_bits.x * code + u_density_bits.y) - 1.0), 0.0);
 }
 
 // Colour and density of a field, at a share of the cube's sides.
@@ -146,9 +146,10 @@ vec3 direction_of(vec2 pixel) {
     return normalize(mat3(u_pose) * seen);
 }
 
-ivec3 cell_of(vec3 share) {
-    vec3 cells = vec3(textureSize(u_clearance, 0));
-    return ivec3(min(share * cells, cells - 1.0));
+// How many cells away from a share of the cube's sides the nearest is that holds anything. A texture's nearest texel is
+// quicker to find, where there is no graphics card, than one of a number.
+float clearance(vec3 share) {
+    return floor(255.0 * textureLod(u_clearance, share, 0.0).r + 0.5);
 }
 
 #if OF_TILES
@@ -170,8 +171,7 @@ float free_way(float step) {
     float cell = 2.0 / float(textureSize(u_clearance, 0).x), s = 0.0;
     while (s < 1.0) {
         vec3 position = point(s), nearest = clamp(position, -1.0, 1.0);
-        float clear = floor(255.0 * texelFetch(u_clearance, cell_of((0.5 * nearest + 0.5).zyx), 0).r + 0.5);
-        float radius = max(0.999 * (clear - 1.0) * cell, largest(abs(position - nearest)));
+        float radius = max(0.999 * (clearance((0.5 * nearest + 0.5).zyx) - 1.0) * cell, largest(abs(position - nearest)));
 #if SPACE == CONTRACTED
         bool is_free = largest(abs(point(s + step) - position)) + spread(s + step) < radius;
         float stride = is_free ? step : 0.0;
@@ -206,19 +206,14 @@ void main() {
 
 #else
 // The step before which the rays of this pixel's tile meet nothing.
-int first_step() {
+float first_step() {
     vec2 bytes = floor(255.0 * texelFetch(u_free, ivec2(gl_FragCoord.xy) / TILE, 0).rg + 0.5);
     float way = dot(bytes, vec2(256.0, 1.0)) / 65535.0;
 #if SPACE == BOX
     vec2 all = around(u_pose[3].xyz);
     way = (mix(all.x, all.y, way) - within.x) / (within.y - within.x);
 #endif
-    return int(float(u_num_steps) * clamp(way, 0.0, 1.0));
-}
-
-// The middle of a step, as a share of the cube's sides in the textures' order.
-vec3 middle(int i, float step) {
-    return clamp(0.5 * point((float(i) + 0.5) * step) + 0.5, 0.0, 1.0).zyx;
+    return floor(float(u_num_steps) * clamp(way, 0.0, 1.0));
 }
 
 void main() {
@@ -228,35 +223,37 @@ void main() {
     vec3 sum = vec3(0.0);
     float light = 1.0;
     if (enter(u_pose[3].xyz, direction_of(pixel))) {
-        float step = 1.0 / float(u_num_steps), length_ = length(extent) * step;
-        float cells = float(textureSize(u_clearance, 0).x);
-        // Steps that surely lead out of no more than one cell; how a contraction bends them, nobody knows.
-        float steps_a_cell = SPACE == CONTRACTED ? 0.0 : 1.998 / (cells * length_ + 1e-6);
-        int end = UNBOUNDED ? u_num_steps - 1 : u_num_steps;  // the last step of an unbounded ray always counts
-        bool inside = false;
-        for (int i = min(first_step(), end); i < u_num_steps; i++) {
-            vec3 share = middle(i, step);
-            while (!inside && i < end) {
-                float clear = 255.0 * texelFetch(u_clearance, cell_of(share), 0).r;
-                if (clear < 0.5) break;
-                i = min(i + 1 + int((floor(clear + 0.5) - 1.0) * steps_a_cell), end);
-                share = middle(i, step);
-            }
-            if (i == u_num_steps) break;
-            vec4 value = mixture(share, strength, density_share);
-            inside = value.a > 0.0;
+        float num_steps = float(u_num_steps), step = 1.0 / num_steps, length_ = length(extent) * step;
+        float end = UNBOUNDED ? num_steps - 1.0 : num_steps;  // the last step of an unbounded ray always counts
+        // The middle of a step is a share of the cube's sides in the textures' order, which hold nothing beyond 0 and 1.
 #if SPACE == CONTRACTED
-            length_ = distance(point(float(i) * step), point(float(i + 1) * step));
+#define MIDDLE (0.5 * point((i + 0.5) * step) + 0.5).zyx
+        float steps_a_cell = 0.0;  // how a contraction bends them, nobody knows
+#else
+#define MIDDLE first + i * further
+        vec3 further = 0.5 * step * extent.zyx, first = 0.5 * start.zyx + 0.5 + 0.5 * further;
+        // Steps that surely lead out of no more than one cell.
+        float steps_a_cell = 1.998 / (float(textureSize(u_clearance, 0).x) * length_ + 1e-6);
 #endif
-            float depth = UNBOUNDED && inside && i == end ? MAX_OPTICAL_DEPTH : value.a * length_;
-            float left = exp(-min(depth, MAX_OPTICAL_DEPTH));
-            sum += light * (1.0 - left) * value.rgb;
-            light *= left;
-            if (light < ENOUGH) {
-                sum += light * value.rgb;
-                light = 0.0;
-                break;
+        bool inside = false;
+        for (float i = min(first_step(), end); i <= num_steps - 1.0; i += 1.0) {
+            vec3 share = MIDDLE;
+            while (!inside && i < end) {
+                float clear = clearance(share);
+                if (clear == 0.0) break;
+                i = min(i + 1.0 + floor((clear - 1.0) * steps_a_cell), end);
+                share = MIDDLE;
             }
+            vec4 value = mixture(share, strength, density_share);
+            inside = value.a > u_least_density;
+#if SPACE == CONTRACTED
+            length_ = distance(point(i * step), point((i + 1.0) * step));
+#endif
+            float passed = light * exp2(-value.a * (UNBOUNDED && i == end ? ENDLESS : length_));
+            passed = passed < ENOUGH ? 0.0 : passed;
+            sum += (light - passed) * value.rgb;
+            light = passed;
+            if (light == 0.0) break;
         }
     }
     color = vec4(sum + light * u_background, 1.0);

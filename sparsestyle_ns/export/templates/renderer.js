@@ -87,9 +87,9 @@ function describeScene(gl, at) {
   gl.uniform2fv(at("u_depths"), space.depths);
   gl.uniform1f(at("u_near"), space.near);
   gl.uniform1f(at("u_unit"), space.unit);
-  gl.uniform1f(at("u_density_unit"), density.unit);
-  gl.uniform1f(at("u_density_step"), density.step);
-  gl.uniform1f(at("u_rounding"), density.rounding);
+  gl.uniform1f(at("u_density_unit"), density.unit * Math.LOG2E);
+  gl.uniform1f(at("u_least_density"), density.unit * Math.LOG2E * Math.expm1(density.step * density.rounding));
+  gl.uniform2f(at("u_density_bits"), 255 * density.step * Math.LOG2E, -density.step * Math.LOG2E);
   gl.uniform3fv(at("u_background"), scene.background);
 }
 
