@@ -2,8 +2,8 @@
 
     python benchmarks/page.py scene.html
 
-The window has 400 × 300 pixels. While the flight plays, the page draws as many pixels as keep it quick, with a third of
-the steps, and once it rests all of them.
+The window has 400 × 300 pixels. While the flight plays, the page draws as many pixels as keep it quick, with a quarter
+of the steps, and once it rests all of them.
 """
 
 import sys

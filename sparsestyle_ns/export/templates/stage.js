@@ -1,8 +1,8 @@
 // What is on the screen: a viewpoint and a look, drawn coarsely while they change and finely once they rest.
 
-const MOVING_SECONDS = 0.048; // with the browser's own work, twenty pictures a second
+const MOVING_SECONDS = 0.047; // with the browser's own work, twenty pictures a second
 const STILL_SECONDS = 0.5;
-const MOVING_STEPS = 0.35; // of the steps along a ray; 34 dB to what all of them show
+const MOVING_STEPS = 0.25; // of the steps along a ray; 30 dB to what all of them show, as far as voxels are from fields
 const SETTLE_MILLISECONDS = 200;
 const POSES_PER_SECOND = 10;
 
