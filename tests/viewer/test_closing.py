@@ -36,8 +36,6 @@ while "Iteration 2" not in panel.restyling.message.content:
 """
 DRAWING = """
 from types import SimpleNamespace
-import viser
-from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 camera = SimpleNamespace(position=(0.0, 0.0, 1.0), wxyz=(1.0, 0.0, 0.0, 0.0), fov=0.8, aspect=1.5)
 camera.on_update = lambda function: function
 client = SimpleNamespace(client_id=0, camera=camera)

@@ -117,7 +117,8 @@ vec3 point(float s) {
 #endif
 
 float density_of(float code) {
-    return max(u_density_unit * (exp2(u_density_bits.x * code + u_density_bits.y) - 1.0), 0.0);
+    float density = u_density_unit * (exp2(u_density_bits.x * code + u_density_bits.y) - 1.0);
+    return density > u_least_density ? density : 0.0;
 }
 
 // Colour and density of a field, at a share of the cube's sides.
@@ -245,7 +246,7 @@ void main() {
                 share = MIDDLE;
             }
             vec4 value = mixture(share, strength, density_share);
-            inside = value.a > u_least_density;
+            inside = value.a > 0.0;
 #if SPACE == CONTRACTED
             length_ = distance(point(i * step), point((i + 1.0) * step));
 #endif

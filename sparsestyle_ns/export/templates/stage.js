@@ -2,7 +2,7 @@
 
 const MOVING_SECONDS = 0.047; // with the browser's own work, twenty pictures a second
 const STILL_SECONDS = 0.5;
-const MOVING_STEPS = 0.25; // of the steps along a ray; 30 dB to what all of them show, as far as voxels are from fields
+const MOVING_STEPS = 0.25; // of the steps along a ray; 30 dB to what all of them show, as the page has to the exact render
 const SETTLE_MILLISECONDS = 200;
 const POSES_PER_SECOND = 10;
 
