@@ -25,6 +25,7 @@ uniform sampler2D u_free;                      // what the tiles have found: a s
 uniform float u_strength, u_density_share, u_blend;
 uniform float u_divider;                       // left of it, in pixels, is the coarse field
 uniform int u_num_steps;
+uniform float u_all_steps;                     // as many as voxels were chosen for
 uniform vec2 u_style_texels, u_coarse_texels;  // from shares of the cube's sides to a texture's: factor and offset
 uniform vec3 u_minimum, u_maximum;       // NDC, box: what becomes the cube
 uniform vec2 u_focal_over_half_size;     // NDC
@@ -226,12 +227,14 @@ void main() {
     if (enter(u_pose[3].xyz, direction_of(pixel))) {
         float num_steps = float(u_num_steps), step = 1.0 / num_steps, length_ = length(extent) * step;
         float end = UNBOUNDED ? num_steps - 1.0 : num_steps;  // the last step of an unbounded ray always counts
+        // Which has its middle where it is with all steps: voxels before that may not be there.
+        float last = UNBOUNDED ? num_steps - 0.5 - 0.5 * num_steps / u_all_steps : end;
         // The middle of a step is a share of the cube's sides in the textures' order, which hold nothing beyond 0 and 1.
 #if SPACE == CONTRACTED
-#define MIDDLE (0.5 * point((i + 0.5) * step) + 0.5).zyx
+#define MIDDLE (0.5 * point(((i == end ? last : i) + 0.5) * step) + 0.5).zyx
         float steps_a_cell = 0.0;  // how a contraction bends them, nobody knows
 #else
-#define MIDDLE first + i * further
+#define MIDDLE first + (i == end ? last : i) * further
         vec3 further = 0.5 * step * extent.zyx, first = 0.5 * start.zyx + 0.5 + 0.5 * further;
         // Steps that surely lead out of no more than one cell.
         float steps_a_cell = 1.998 / (float(textureSize(u_clearance, 0).x) * length_ + 1e-6);

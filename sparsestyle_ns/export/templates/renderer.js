@@ -85,6 +85,7 @@ function describeScene(gl, at) {
   gl.uniform3fv(at("u_maximum"), space.maximum);
   gl.uniform2fv(at("u_focal_over_half_size"), space.focal_over_half_size);
   gl.uniform2fv(at("u_depths"), space.depths);
+  gl.uniform1f(at("u_all_steps"), scene.num_steps);
   gl.uniform1f(at("u_near"), space.near);
   gl.uniform1f(at("u_unit"), space.unit);
   gl.uniform1f(at("u_density_unit"), density.unit * Math.LOG2E);
