@@ -23,7 +23,7 @@ KINDS: Dict[str, Tuple[str, str]] = {
     "FreeNeRF-style field + ARF kind": ("arf", "freenerf"),
 }
 """By name, the kinds of stage 2 and stage 1."""
-CONTENT_WEIGHTS: Dict[str, Tuple[float, ...]] = {"ours": (0.03, 0.3, 3.0), "arf": (0.03, 0.3, 3.0)}
+CONTENT_WEIGHTS: Dict[str, Tuple[float, ...]] = {"ours": (0.3, 10.0, 30.0, 100.0), "arf": (0.03, 0.3, 3.0)}
 """Of each kind of stage 2, from the strongest style to the most content."""
 FRAME_BY_FRAME = "frame by frame (AdaIN's kind)"
 DISTANCES = ("style_loss", "texture_distance", "color_distance")
