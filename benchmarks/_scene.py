@@ -276,7 +276,7 @@ class PlainTraining:
         view, rows = views[index], pixels.rows(index)
         self.optimizer.zero_grad()
         image = self.field.render(pixels.origins[rows], pixels.directions[rows]).view(view.picture.shape)
-        values = targets.losses(targets.view(image, view.features, view.accumulation))
+        values = targets.losses(targets.view(image, view.content, view.accumulation))
         sum(Losses(values, self.pipeline.config.weights_at(self.num_steps, schedule)).terms().values()).backward()
         self.optimizer.step()
         self.num_steps += 1

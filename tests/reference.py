@@ -222,3 +222,20 @@ def hash_encoding(position, table, resolutions, table_size):
             features = [feature + weight * value for feature, value in zip(features, stored, strict=True)]
         encoded += features
     return encoded
+
+
+def brightness_ssim(first, second):
+    """SSIM (Wang et al. 2004, Eq. 13) of the brightness of pictures, pixel by pixel, with the window's inner part."""
+    a, b = (picture.numpy() @ np.array([0.2989, 0.587, 0.114]) for picture in (first, second))
+    values = []
+    for y, x in itertools.product(*map(range, a.shape)):
+        near = np.s_[max(0, y - 5) : y + 6, max(0, x - 5) : x + 6]
+        rows, columns = (each[near] for each in np.mgrid[: a.shape[0], : a.shape[1]])
+        weights = np.exp(-((rows - y) ** 2 + (columns - x) ** 2) / (2 * 1.5**2))
+        weights /= weights.sum()
+        mean_a, mean_b = (weights * a[near]).sum(), (weights * b[near]).sum()
+        variance_a, variance_b = (weights * a[near] ** 2).sum() - mean_a**2, (weights * b[near] ** 2).sum() - mean_b**2
+        covariance = (weights * a[near] * b[near]).sum() - mean_a * mean_b
+        likeness = (2 * mean_a * mean_b + 0.01**2) * (2 * covariance + 0.03**2)
+        values.append(likeness / ((mean_a**2 + mean_b**2 + 0.01**2) * (variance_a + variance_b + 0.03**2)))
+    return np.mean(values)

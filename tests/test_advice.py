@@ -22,6 +22,7 @@ from PIL import Image
 from test_docs import ROOT, all_flags, nerfstudio_flags, subcommands
 
 from sparsestyle_ns.cli import main
+from sparsestyle_ns.losses.stylization import LOSSES
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.studies.time_budget import Budget
 from sparsestyle_ns.utils.errors import InputError
@@ -522,12 +523,13 @@ TABLE = [
     # Settings of stage 2
     Advice("--pipeline.view-side is ", style("--pipeline.view-side 0"), style("--pipeline.view-side photos")),
     Advice("--pipeline.object-style is ", style("--pipeline.object-style 0"), style("--pipeline.object-style 1")),
+    Advice("--pipeline.kept-structure is ", style("--pipeline.kept-structure 2"), style("--pipeline.kept-structure 1")),
     Advice("--stroke-size is ", style("--stroke-size 3"), style("--stroke-size 2")),
     Advice("name a painting with --style-image FILE", "ns-train hier-style --data {scene} llff-data", style("")),
     Advice("--pipeline.style-features is ", style("--pipeline.style-features 0"), style("--pipeline.style-features 1")),
     Advice(
         "--pipeline.loss-weights turns every loss off",
-        style(" ".join(f"--pipeline.loss-weights.{name} 0" for name in ("content", "style", "colors", "textures"))),
+        style(" ".join(f"--pipeline.loss-weights.{name} 0" for name in LOSSES)),
         style("--pipeline.loss-weights.style 1"),
     ),
     Advice("; give a finite number, 0 or more", style("--pipeline.loss-weights.style nan"), style("")),

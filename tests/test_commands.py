@@ -111,7 +111,7 @@ def test_variants_named_after_the_paper_have_its_settings() -> None:
     settings, model = style.pipeline, style.pipeline.model
     (level,) = settings.levels(style.max_num_iterations)
     assert (level.scale, level.length) == (1.0, 200)
-    assert settings.loss_weights == {"content": 10.0, "style": 1.0, "colors": 0.0, "textures": 0.0}
+    assert settings.loss_weights == {"content": 10.0, "style": 1.0, "colors": 0.0, "textures": 0.0, "structure": 0.0}
     assert settings.content_decay == 0.01
     assert settings.content_share * level.length == 100
     assert (settings.warm_start_steps, settings.thinning) == (0, 0.0)

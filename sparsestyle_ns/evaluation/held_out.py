@@ -210,7 +210,7 @@ class StyleFigures:
         the most similar one of some place; `stroke_width` is that of `metrics.strokes` in pixels, and the rest are of
         `StyleDistance`. With `accumulation`, only where the scene covers the picture: a background can't be stylised.
         """
-        content, figures = self.targets.features(coarse), {}
+        content, figures = self.targets.content(coarse), {}
         for suffix, picture in (("_before", coarse), ("", stylised)):
             view = self.targets.view(picture, content, accumulation)
             found = {f"{name}_loss": float(value) for name, value in self.targets.losses(view).items()}
@@ -221,7 +221,8 @@ class StyleFigures:
                 chosen = nearest_neighbors(view.features, self.index)
                 found["features_used"] = len(chosen.unique()) / min(len(chosen), self.num_features)
             figures |= {f"{name}{suffix}": value for name, value in found.items()}
-        figures.pop("content_loss_before", None)
+        for name in ("content", "structure"):  # what keeps a view like its content, which it is before
+            figures.pop(f"{name}_loss_before", None)
         return figures
 
 

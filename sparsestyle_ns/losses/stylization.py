@@ -12,7 +12,8 @@ from sparsestyle_ns.core.feature_maps import covered_rows, feature_rows
 from sparsestyle_ns.losses.content import ContentLoss
 from sparsestyle_ns.losses.nnfm import NNFMLoss
 from sparsestyle_ns.losses.sliced import ColorLoss, TextureLoss
-from sparsestyle_ns.losses.stylization_loss import PaintingFeatures, StylizationLoss, StylizedView
+from sparsestyle_ns.losses.structure import StructureLoss
+from sparsestyle_ns.losses.stylization_loss import Content, PaintingFeatures, StylizationLoss, StylizedView
 from sparsestyle_ns.style.backbone import Backbone
 
 LOSSES: Dict[str, Type[StylizationLoss]] = {
@@ -20,6 +21,7 @@ LOSSES: Dict[str, Type[StylizationLoss]] = {
     "style": NNFMLoss,
     "colors": ColorLoss,
     "textures": TextureLoss,
+    "structure": StructureLoss,
 }
 """A new one is a file with a `StylizationLoss`, and its entry here."""
 
@@ -74,6 +76,8 @@ class StyleTargets:
         feature_side: longer side, in pixels, at which the network sees all pictures; the smaller,
             the wider strokes are.
         style_features: at most so many of the style image's feature vectors count, drawn at random; None: all.
+        losses: names of those that are asked for.
+        kept_structure: the SSIM of brightness to the content picture that a view keeps at least, in [0, 1].
     """
 
     def __init__(
@@ -83,8 +87,9 @@ class StyleTargets:
         feature_side: int,
         style_features: Optional[int] = None,
         losses: Collection[str] = ("content", "style"),
+        kept_structure: float = 0.0,
     ) -> None:
-        self.backbone, self.feature_side = backbone, feature_side
+        self.backbone, self.feature_side, self.kept_structure = backbone, feature_side, kept_structure
         self.style_image = style_image
         with torch.no_grad():
             rows = self.style_rows()
@@ -95,6 +100,11 @@ class StyleTargets:
     def features(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 C h w"]:
         """The network's view of a picture."""
         return self.backbone(fit_side(image.permute(2, 0, 1)[None], self.feature_side, self.backbone.smallest_side))
+
+    def content(self, picture: Float[Tensor, "H W 3"]) -> Content:
+        """A picture that a view must stay like, without gradients."""
+        with torch.no_grad():
+            return Content(picture, self.features(picture))
 
     @property
     def style_picture(self) -> Float[Tensor, "3 h w"]:
@@ -109,13 +119,15 @@ class StyleTargets:
     def view(
         self,
         image: Float[Tensor, "H W 3"],
-        content: Float[Tensor, "1 C h w"],
+        content: Content,
         accumulation: Optional[Float[Tensor, "H W"]] = None,
         step: int = 0,
     ) -> StylizedView:
-        """A rendered picture in [0, 1], ready for the losses; features count where the accumulation is above half."""
-        maps = self.features(image), content, image.permute(2, 0, 1)[None]
-        return StylizedView(image, *(covered_rows(each, accumulation) for each in maps), step)
+        """A rendered picture in [0, 1], ready for the losses; what counts is where the accumulation is above half."""
+        maps = self.features(image), content.features, image.permute(2, 0, 1)[None]
+        rows = (covered_rows(each, accumulation) for each in maps)
+        covered = None if accumulation is None else accumulation > 0.5
+        return StylizedView(image, content.picture, *rows, covered, self.kept_structure, step)
 
     def losses(self, view: StylizedView) -> Dict[str, Float[Tensor, ""]]:
         """The losses of a view, by name, not weighted."""

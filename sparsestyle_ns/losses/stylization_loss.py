@@ -2,9 +2,9 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple, Optional
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
@@ -16,17 +16,30 @@ class PaintingFeatures:
     rows: Float[Tensor, "rows C"]
 
 
+class Content(NamedTuple):
+    """What a view must stay like: a picture in [0, 1], and the feature network's view of it."""
+
+    picture: Float[Tensor, "H W 3"]
+    features: Float[Tensor, "1 C h w"]
+
+
 @dataclass(frozen=True)
 class StylizedView:
     """A rendered view, and what it must stay like."""
 
     image: Float[Tensor, "H W 3"]
+    picture: Float[Tensor, "H W 3"]
+    """The content picture."""
     features: Float[Tensor, "rows C"]
     """Of the picture, where the scene covers it; differentiable."""
     content: Float[Tensor, "rows C"]
     """Those of the content picture."""
     colors: Float[Tensor, "pixels 3"]
     """Of the picture, where the scene covers it; differentiable."""
+    covered: Optional[Bool[Tensor, "H W"]] = None
+    """Where the scene covers the picture; None: everywhere."""
+    kept_structure: float = 0.0
+    """The SSIM of brightness to the content picture that it keeps at least."""
     step: int = 0
     """The iteration, for what a loss draws at random."""
 

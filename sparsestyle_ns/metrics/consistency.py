@@ -4,10 +4,10 @@ import statistics
 from typing import Dict, List, Optional, Sequence
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from sparsestyle_ns.core.similarity import masked_ssim
 from sparsestyle_ns.metrics.image import Metric, perceptual_metrics
 from sparsestyle_ns.metrics.warping import Correspondence, Surface, correspond, sample_picture
 from sparsestyle_ns.utils.progress import track
@@ -16,8 +16,6 @@ RANGES = {"short": 1, "long": 7}
 """Frames between the two views of a pair, as in Stylos and Styl3R."""
 PERCEPTUAL_EVERY = 3
 """Perceptual distances are of every third pair: they take most of the time, and neighbours say the same."""
-SSIM_SIGMA, SSIM_RADIUS, SSIM_CONSTANTS = 1.5, 5, (0.01**2, 0.03**2)
-"""The Gaussian window of SSIM, 11 × 11, and what keeps its quotients finite (Wang et al. 2004)."""
 
 Picture = Float[Tensor, "H W 3"]
 Mask = Bool[Tensor, "H W"]
@@ -26,32 +24,6 @@ Mask = Bool[Tensor, "H W"]
 def masked_rmse(first: Picture, second: Picture, visible: Mask) -> Float[Tensor, ""]:
     """Root of the mean squared difference over visible pixels and channels; NaN where none is visible."""
     return (first - second)[visible].square().mean().sqrt()
-
-
-def masked_ssim(first: Picture, second: Picture, visible: Mask) -> Float[Tensor, ""]:
-    """Mean SSIM (Wang et al. 2004) of pictures in [0, 1], by visible pixels alone; NaN where none is visible."""
-    offsets = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, device=first.device, dtype=first.dtype)
-    profile = torch.exp(-0.5 * (offsets / SSIM_SIGMA).square())
-    row = (profile / profile.sum())[None, None, None]
-    mask = visible.to(first.dtype)[None, None]
-
-    def weighed(values: Float[Tensor, "C 1 H W"]) -> Float[Tensor, "C 1 H W"]:
-        # The window is a product, and twice eleven pixels are quicker than eleven times eleven.
-        return F.conv2d(F.conv2d(values, row, padding=(0, SSIM_RADIUS)), row.mT, padding=(SSIM_RADIUS, 0))
-
-    share = weighed(mask).clamp_min(torch.finfo(first.dtype).tiny)
-
-    def mean(values: Float[Tensor, "C 1 H W"]) -> Float[Tensor, "C 1 H W"]:
-        return weighed(values * mask) / share
-
-    x, y = (picture.permute(2, 0, 1)[:, None] for picture in (first, second))
-    mean_x, mean_y = mean(x), mean(y)
-    variance_x, variance_y = mean(x * x) - mean_x.square(), mean(y * y) - mean_y.square()
-    covariance = mean(x * y) - mean_x * mean_y
-    c1, c2 = SSIM_CONSTANTS
-    likeness = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
-    likeness = likeness / ((mean_x.square() + mean_y.square() + c1) * (variance_x + variance_y + c2))
-    return likeness[:, 0].mean(dim=0)[visible].mean()
 
 
 def masked_distance(metric: Metric, first: Picture, second: Picture, visible: Mask) -> float:

@@ -62,6 +62,9 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     """Weight of each loss, 0 or more; 0 is off. That of the content loss is λ0, which falls (Eq. 6)."""
     object_style: float = 4.0
     """How many times the style loss's weight counts for an object on a background, which keeps its shape by itself."""
+    kept_structure: float = 0.5
+    """The SSIM of brightness to its content picture that a view keeps at least, from 0 to 1, however strong the
+    painting's patterns are; more keeps more of the scene, and less of the painting."""
     content_decay: float = 0.01
     """α, the share of the content loss's weight that is left in the end."""
     content_share: float = 0.6
@@ -97,6 +100,8 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
                 raise InputError(f"--pipeline.loss-weights.{name} is {weight}; give a finite number, 0 or more.")
         if isinstance(self.view_side, int) and self.view_side < 1:
             raise InputError(f"--pipeline.view-side is {self.view_side}; give a number of pixels, or photos.")
+        if not 0.0 <= self.kept_structure <= 1.0:
+            raise InputError(f"--pipeline.kept-structure is {self.kept_structure:g}; give a number from 0 to 1.")
         if not 0.0 < self.object_style < math.inf:
             raise InputError(f"--pipeline.object-style is {self.object_style}; give a number above 0.")
         if not any(self.loss_weights.values()):
@@ -132,7 +137,8 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         """
         side = self.side_at(scale, photo_side)
         losses = [name for name, weight in self.loss_weights.items() if weight > 0]
-        return StyleTargets(backbone.to(device), painting.pixels.to(device), side, self.style_features, losses)
+        counted = self.style_features, losses, self.kept_structure
+        return StyleTargets(backbone.to(device), painting.pixels.to(device), side, *counted)
 
     def weights_at(self, step: int, level: Level) -> Dict[str, float]:
         """The weight of each loss that is on, in an iteration; that of the content loss is λ(t) (Eq. 6).
@@ -271,7 +277,7 @@ class HierStylePipeline(CheckedPipeline):
             generator = torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + step)
             task.style.thinning = Thinning(self.config.thinning, generator)
         image = self.scene_views.render(view, task.style)
-        values = targets.losses(targets.view(image, view.features, view.accumulation, step))
+        values = targets.losses(targets.view(image, view.content, view.accumulation, step))
         weights = self.config.weights_at(step, schedule)
         if self.model.background is not None and "style" in weights:
             weights["style"] *= self.config.object_style
@@ -292,7 +298,7 @@ class HierStylePipeline(CheckedPipeline):
         self.eval()
         camera, batch = self.datamanager.next_eval_image(step)
         outputs = self.model.get_outputs_for_camera(camera)
-        content = self.targets.features(batch["image"][..., :3].to(self.device))
+        content = self.targets.content(batch["image"][..., :3].to(self.device))
         accumulation = None if self.model.background is None else outputs["accumulation"].squeeze(-1)
         values = self.targets.losses(self.targets.view(outputs["rgb"], content, accumulation))
         self.train()

@@ -13,6 +13,7 @@ from sparsestyle_ns.core.camera_paths import at_poses, poses_between
 from sparsestyle_ns.data.photos import at_scale
 from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.losses.stylization import StyleTargets
+from sparsestyle_ns.losses.stylization_loss import Content
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, TrainingPixels
 from sparsestyle_ns.rendering.frozen_view import FrozenView
@@ -41,6 +42,11 @@ class ContentView:
     """The feature network's view of the picture, once a painting has asked for it."""
     seen_at: int = 0
     """The longer side, in pixels, at which it saw the picture."""
+
+    @property
+    def content(self) -> Content:
+        """What it must stay like, once a painting has asked for it."""
+        return Content(self.picture, self.features)
 
 
 class SceneViews:

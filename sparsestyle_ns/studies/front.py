@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Dict, List, Mapping, Optional, Sequence, Tuple
+from typing import Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 from sparsestyle_ns.evaluation.tables import LABELS, PERCEPTUAL, STYLE, Table, table_of
 from sparsestyle_ns.studies.baselines import can_transfer, transfer_frames
@@ -23,8 +23,23 @@ KINDS: Dict[str, Tuple[str, str]] = {
     "FreeNeRF-style field + ARF kind": ("arf", "freenerf"),
 }
 """By name, the kinds of stage 2 and stage 1."""
-CONTENT_WEIGHTS: Dict[str, Tuple[float, ...]] = {"ours": (0.3, 10.0, 30.0, 100.0), "arf": (0.03, 0.3, 3.0)}
-"""Of each kind of stage 2, from the strongest style to the most content."""
+
+
+class Sweep(NamedTuple):
+    """The setting by which a kind of stage 2 keeps more or less content."""
+
+    setting: str
+    label: str
+    """In tables and plots."""
+    values: Tuple[float, ...]
+    """From the strongest style to the most content."""
+
+
+SWEEPS = {
+    "ours": Sweep("pipeline.kept_structure", "structure", (0.0, 0.4, 0.6, 0.8)),
+    "arf": Sweep("pipeline.loss_weights.content", "λ", (0.03, 0.3, 3.0)),
+}
+"""Of each kind of stage 2."""
 FRAME_BY_FRAME = "frame by frame (AdaIN's kind)"
 DISTANCES = ("style_loss", "texture_distance", "color_distance")
 """What all train on, a distance of another network that none trains on, and one of colours."""
@@ -40,8 +55,8 @@ class FrontPoint:
     """A run's kept content, and its figures."""
 
     kind: str
-    content: Optional[float]
-    """The content weight that it began with; None for a kind that has none."""
+    value: Optional[float]
+    """Of the setting that keeps content; None for a kind that has none."""
     measured: RunFigures
 
     @property
@@ -56,21 +71,21 @@ class Fronts:
     def __init__(self, runs: PaperRuns, painting: Path, queue: RunQueue) -> None:
         self.runs, self.painting, self.queue = runs, painting, queue
 
-    def _run(self, kind: str, content: float, iterations: Optional[int] = None) -> Run:
+    def _run(self, kind: str, value: float, iterations: Optional[int] = None) -> Run:
         style, coarse = KINDS[kind]
-        return self.runs.stylised(self.painting, style, coarse, content, iterations)
+        return self.runs.stylised(self.painting, style, coarse, (SWEEPS[style].setting, value), iterations)
 
     def train(self) -> Dict[str, List[Run]]:
         """Brings all runs to their end, those of each kind with as many iterations as ours takes the time for."""
-        weights = {kind: CONTENT_WEIGHTS[style] for kind, (style, _) in KINDS.items()}
-        found = {OURS: [self._run(OURS, content) for content in weights[OURS]]}
+        values = {kind: SWEEPS[style].values for kind, (style, _) in KINDS.items()}
+        found = {OURS: [self._run(OURS, value) for value in values[OURS]]}
         self.queue.train(found[OURS])
         seconds = median(self._seconds_of(run, run.iterations) for run in found[OURS])
         for kind in (kind for kind in KINDS if kind != OURS):
-            probe = self._run(kind, weights[kind][0], PROBE_ITERATIONS)
+            probe = self._run(kind, values[kind][0], PROBE_ITERATIONS)
             self.queue.train([probe])
             count = max(1, round(PROBE_ITERATIONS * seconds / self._seconds_of(probe, PROBE_ITERATIONS)))
-            found[kind] = [self._run(kind, content, count) for content in weights[kind]]
+            found[kind] = [self._run(kind, value, count) for value in values[kind]]
             self.queue.train(found[kind])
         return found
 
@@ -88,8 +103,8 @@ class Fronts:
         measure = PaintingMeasure(self.painting)
         points = []
         for kind, runs in found.items():
-            for content, run in zip(CONTENT_WEIGHTS[KINDS[kind][0]], runs, strict=True):
-                points.append(FrontPoint(kind, content, measure_run(run.folder, measure)))
+            for value, run in zip(SWEEPS[KINDS[kind][0]].values, runs, strict=True):
+                points.append(FrontPoint(kind, value, measure_run(run.folder, measure)))
         if can_transfer():
             ours = found[OURS][0].folder
             by_frame = measure_run(
@@ -107,8 +122,8 @@ def front_section(runs: PaperRuns, painting: Path, queue: RunQueue) -> Section:
     iterations = ", ".join(f"{kind}: {runs_of[0].iterations}" for kind, runs_of in found.items())
     text = (
         f"Each kind has the time that ours takes for its iterations, on views of the same sizes ({iterations}). "
-        "Content weights run from strong style to much content. Measured on frames of the path between the training "
-        "cameras, each kind by its own unstylised geometry."
+        "Ours keeps ever more structure, and the others have ever larger content weights. Measured on frames of the "
+        "path between the training cameras, each kind by its own unstylised geometry."
     )
     section = Section(f"Style against content: {runs.study.name} in the style of {painting.stem}", text)
     section.tables = [points_table(points), ratios_table(points)]
@@ -122,7 +137,9 @@ def front_section(runs: PaperRuns, painting: Path, queue: RunQueue) -> Section:
 
 def point_name(point: FrontPoint) -> str:
     """A point in words."""
-    return point.kind if point.content is None else f"{point.kind}, λ = {point.content:g}"
+    return (
+        point.kind if point.value is None else f"{point.kind}, {SWEEPS[KINDS[point.kind][0]].label} = {point.value:g}"
+    )
 
 
 def points_table(points: Sequence[FrontPoint]) -> Table:
@@ -136,7 +153,7 @@ def ratios_table(points: Sequence[FrontPoint]) -> Table:
     """What ours has of ARF's kind's distances where it keeps as much content, or more; below 1 is better."""
     keys = (*DISTANCES, "short_rmse", "long_rmse")
     labels = [LABELS[key][0] if key in LABELS else f"{key[:-5]} {LABELS['rmse'][0]}" for key in keys]
-    table = Table("Ours over ARF's kind at equal content kept, or where ours keeps more with every weight", labels)
+    table = Table("Ours over ARF's kind at equal content kept, or where ours keeps more with every setting", labels)
     for level in KEPT_LEVELS:
         pairs = [[at_kept(points, OURS, key, level, or_more=True), at_kept(points, ARF, key, level)] for key in keys]
         cells = [None if None in pair else f"{pair[0] / pair[1]:.2f}" for pair in pairs]

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Dict, Optional, Tuple
 
+from sparsestyle_ns.losses.stylization import LOSSES
 from sparsestyle_ns.studies.run_queue import Run, Settings
 from sparsestyle_ns.studies.study import Stage, Study
 from sparsestyle_ns.style.backbones import available_backbone
@@ -24,8 +25,7 @@ COLORS_ALONE: Settings = {"pipeline.effects.view_color": "on", "pipeline.effects
 CONSTANT: Settings = {"pipeline.content_decay": 1.0, "pipeline.content_restart": 1.0}
 """The content weight stays as it is in all iterations, at each size of the views."""
 PAPER_LOSSES: Settings = {
-    "pipeline.loss_weights.colors": 0.0,
-    "pipeline.loss_weights.textures": 0.0,
+    **{f"pipeline.loss_weights.{name}": 0.0 for name in LOSSES if name not in ("content", "style")},
     "pipeline.object_style": 1.0,
 }
 """Content and style alone, as ARF and the paper have it."""
@@ -92,18 +92,18 @@ class PaperRuns:
         painting: Path,
         style_kind: str = "ours",
         coarse_kind: str = "ours",
-        content: Optional[float] = None,
+        varied: Optional[Tuple[str, float]] = None,
         own_iterations: Optional[int] = None,
     ) -> Run:
-        """The run of stage 2 of a kind, on a coarse field of a kind; of another content weight or length if given."""
+        """The run of stage 2 of a kind, on a coarse field of a kind; if given, with a setting varied, or longer."""
         iterations = own_iterations or self.study.iterations("hier-style")
         colors = {} if coarse_kind == "ours" else COLORS_ALONE
-        weight = {} if content is None else {"pipeline.loss_weights.content": content}
-        settings = {**STYLE_KINDS[style_kind], **weight, **colors, **EVERY_LOSS, **self._network("hier-style")}
+        setting = {} if varied is None else dict([varied])
+        settings = {**STYLE_KINDS[style_kind], **setting, **colors, **EVERY_LOSS, **self._network("hier-style")}
         return Run(
             self.study,
             self.output_dir,
-            name=f"{coarse_kind}-{style_kind}-{painting.stem}" + ("" if content is None else f"-{content:g}"),
+            name=f"{coarse_kind}-{style_kind}-{painting.stem}" + ("" if varied is None else f"-{varied[1]:g}"),
             stage="hier-style",
             settings=tuple(settings.items()),
             painting=painting,

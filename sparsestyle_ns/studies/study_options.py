@@ -64,7 +64,7 @@ class CompareOptions(StudyOptions):
     """
 
     front: bool = False
-    """Draw style against kept content instead: several content weights of each way of stylising, all in equal time."""
+    """Draw style against kept content instead: each way of stylising keeps less and more, all in equal time."""
 
 
 @dataclass

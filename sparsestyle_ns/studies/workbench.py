@@ -190,7 +190,7 @@ class Workbench:
             figures = image_metrics(outputs["rgb"], self.photos[view])
             return {name: figures[name] for name in ("psnr", "ssim")}
         accumulation = None if model.background is None else outputs["accumulation"].squeeze(-1)
-        content = self.targets.features(outputs["rgb_coarse"])
+        content = self.targets.content(outputs["rgb_coarse"])
         losses = self.targets.losses(self.targets.view(outputs["rgb"], content, accumulation))
         return {f"{name}_loss": float(losses[name]) for name in ("style", "content")}
 

@@ -253,7 +253,7 @@ def test_constant_images_have_finite_losses(backbone, value):
         (torch.rand(3, 20, 16), torch.rand(16, 16, 3)),
     ):
         targets = StyleTargets(backbone, style, feature_side=16)
-        losses = list(targets.losses(targets.view(picture, targets.features(content))).values())
+        losses = list(targets.losses(targets.view(picture, targets.content(content))).values())
         (gradient,) = torch.autograd.grad(sum(losses), picture)
         assert all(loss.isfinite() for loss in losses) and gradient.isfinite().all()
         if content.equal(picture):
@@ -271,7 +271,7 @@ def test_the_smallest_and_the_longest_style_have_features(backbone, height, widt
     style = torch.rand(3, height, width, generator=torch.Generator().manual_seed(0))
     targets = StyleTargets(backbone, style, feature_side=48)
     assert min(fit_side(style[None], 48, backbone.smallest_side).shape[-2:]) >= 8
-    view = targets.view(torch.rand(16, 16, 3), targets.features(torch.rand(16, 16, 3)))
+    view = targets.view(torch.rand(16, 16, 3), targets.content(torch.rand(16, 16, 3)))
     assert targets.losses(view)["style"].isfinite()
 
 
@@ -300,7 +300,7 @@ def test_views_of_hardly_anything_have_finite_losses(backbone, covered):
     accumulation = torch.zeros(256)
     accumulation[:covered] = 1
     targets = StyleTargets(backbone, torch.rand(3, 16, 16), feature_side=16)
-    view = targets.view(picture, targets.features(torch.rand(16, 16, 3)), accumulation.view(16, 16))
+    view = targets.view(picture, targets.content(torch.rand(16, 16, 3)), accumulation.view(16, 16))
     losses = list(targets.losses(view).values())
     (gradient,) = torch.autograd.grad(sum(losses), picture)
     assert all(loss.isfinite() for loss in losses) and gradient.isfinite().all()

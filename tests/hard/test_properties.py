@@ -28,7 +28,7 @@ import sparsestyle_ns.losses
 import sparsestyle_ns.rendering
 import sparsestyle_ns.style
 from sparsestyle_ns.core import feature_maps as maps_of
-from sparsestyle_ns.core import ndc, precision, rotations, sampling, schedules, sliced, triangulation
+from sparsestyle_ns.core import ndc, precision, rotations, sampling, schedules, similarity, sliced, triangulation
 from sparsestyle_ns.core import occupancy as density_grid
 from sparsestyle_ns.core import spaces as space
 from sparsestyle_ns.core import volrend as compositing
@@ -45,7 +45,7 @@ from sparsestyle_ns.field_components import (
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.losses import coarse as coarse_losses
-from sparsestyle_ns.losses import content, nnfm, style_index
+from sparsestyle_ns.losses import content, nnfm, structure, style_index
 from sparsestyle_ns.losses import stylization as targets
 from sparsestyle_ns.rendering import baked, frozen_view, mixing, visible_samples
 from sparsestyle_ns.rendering import render as volume
@@ -658,6 +658,21 @@ def test_squared_errors_are_relative_and_finite(data, count, size, dtype):
     for value in (loss, error):
         (gradient,) = torch.autograd.grad(value, features, retain_graph=True)
         assert gradient.isfinite().all()
+
+
+@covers(structure.structure_loss, similarity.masked_ssim)
+@given(st.data(), st.integers(1, 20), st.integers(1, 20), st.floats(0, 1), ALL_FLOATS)
+def test_structure_of_pictures_of_any_size_is_between_opposite_and_equal(data, height, width, kept, dtype):
+    image = data.draw(tensors((height, width, 3), 0, 1, dtype=dtype)).requires_grad_()
+    picture = data.draw(tensors((height, width, 3), 0, 1, dtype=dtype))
+    covered = torch.rand(height, width, generator=torch.Generator().manual_seed(height)) > 0.5
+    likeness = similarity.masked_ssim(image.detach().double(), picture.double(), torch.ones_like(covered))
+    assert -1 - 1e-6 <= likeness <= 1 + 1e-6
+    for mask in (None, covered):
+        loss = structure.structure_loss(image, picture, kept, mask)
+        (gradient,) = torch.autograd.grad(loss, image, retain_graph=True)
+        assert 0 <= loss <= 1 + kept + 1e-4 and gradient.isfinite().all()
+        assert structure.structure_loss(picture, picture, kept, mask) < 1e-3
 
 
 @covers(coarse_losses.pooled_features, coarse_losses.semantic_loss)

@@ -14,7 +14,7 @@ def painting(height: int = 12, width: int = 16) -> PaintingFeatures:
 
 
 def view(colors: torch.Tensor, features: torch.Tensor, step: int = 0) -> StylizedView:
-    return StylizedView(colors[None], features, features, colors, step)
+    return StylizedView(colors[None], colors[None], features, features, colors, step=step)
 
 
 def test_a_view_of_the_paintings_own_colours_and_textures_wherever_they_are_costs_nothing():

@@ -30,17 +30,17 @@ def test_fit_side_makes_the_longer_side_as_asked_and_keeps_the_proportions():
 
 def test_losses_are_those_of_all_features_where_nothing_is_transparent():
     targets, image, photo = make_targets(), torch.rand(16, 16, 3), torch.rand(16, 16, 3)
-    content = targets.features(photo)
+    content = targets.content(photo)
     losses = targets.losses(targets.view(image, content))
     rows = feature_rows(targets.features(image))
     torch.testing.assert_close(losses["style"], nnfm_loss(rows, targets.style_rows()))
-    torch.testing.assert_close(losses["content"], content_loss(rows, feature_rows(content)))
+    torch.testing.assert_close(losses["content"], content_loss(rows, feature_rows(content.features)))
     torch.testing.assert_close(targets.losses(targets.view(image, content, torch.ones(16, 16))), losses)
 
 
 def test_what_the_background_shows_changes_no_loss():
     targets, photo = make_targets(), torch.rand(16, 16, 3)
-    content = targets.features(photo)
+    content = targets.content(photo)
     accumulation = torch.zeros(16, 16)
     accumulation[:, 8:] = 1.0
     first, second = torch.rand(2, 16, 16, 3)
@@ -57,7 +57,7 @@ def test_with_few_style_features_the_loss_is_that_against_some_of_the_painting()
     losses = []
     for count in (None, 16, 4, 1):
         targets = StyleTargets(Patches(), picture, 16, style_features=count)
-        losses.append(float(targets.losses(targets.view(image, targets.features(image)))["style"]))
+        losses.append(float(targets.losses(targets.view(image, targets.content(image)))["style"]))
     assert losses[0] == losses[1]  # there are 16 in all
     assert losses[1] < losses[2] < losses[3]
 

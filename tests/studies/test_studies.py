@@ -217,7 +217,8 @@ def test_compare_draws_style_against_content_in_equal_time(
     monkeypatch.setattr(front, "transfer_frames", lambda frames, painting: [1.0 - frame for frame in frames])
     kinds = ("ours", "arf")
     monkeypatch.setattr(front, "PROBE_ITERATIONS", 4)
-    monkeypatch.setattr(front, "CONTENT_WEIGHTS", dict.fromkeys(kinds, (0.1, 1.0)))
+    for kind in kinds:
+        monkeypatch.setitem(front.SWEEPS, kind, front.SWEEPS[kind]._replace(values=(0.1, 1.0)))
     monkeypatch.setattr(front, "KINDS", {name: front.KINDS[name] for name in (front.OURS, front.ARF)})
     main([*arguments("compare", llff_scene, painting, tmp_path, 4), "--front"])
     assert set(train_here) == {"ours", *(f"ours-{kind}-painting-{weight}" for kind in kinds for weight in ("0.1", "1"))}
