@@ -523,7 +523,7 @@ TABLE = [
     # Settings of stage 2
     Advice("--pipeline.view-side is ", style("--pipeline.view-side 0"), style("--pipeline.view-side photos")),
     Advice("--pipeline.object-style is ", style("--pipeline.object-style 0"), style("--pipeline.object-style 1")),
-    Advice("--pipeline.kept-structure is ", style("--pipeline.kept-structure 2"), style("--pipeline.kept-structure 1")),
+    Advice("--kept-structure is ", style("--kept-structure 2"), style("--kept-structure 1")),
     Advice("--stroke-size is ", style("--stroke-size 3"), style("--stroke-size 2")),
     Advice("name a painting with --style-image FILE", "ns-train hier-style --data {scene} llff-data", style("")),
     Advice("--pipeline.style-features is ", style("--pipeline.style-features 0"), style("--pipeline.style-features 1")),

@@ -62,7 +62,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     """Weight of each loss, 0 or more; 0 is off. That of the content loss is λ0, which falls (Eq. 6)."""
     object_style: float = 4.0
     """How many times the style loss's weight counts for an object on a background, which keeps its shape by itself."""
-    kept_structure: float = 0.5
+    kept_structure: Annotated[float, tyro.conf.arg(aliases=("--kept-structure",))] = 0.5
     """The SSIM of brightness to its content picture that a view keeps at least, from 0 to 1, however strong the
     painting's patterns are; more keeps more of the scene, and less of the painting."""
     content_decay: float = 0.01
@@ -101,7 +101,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
         if isinstance(self.view_side, int) and self.view_side < 1:
             raise InputError(f"--pipeline.view-side is {self.view_side}; give a number of pixels, or photos.")
         if not 0.0 <= self.kept_structure <= 1.0:
-            raise InputError(f"--pipeline.kept-structure is {self.kept_structure:g}; give a number from 0 to 1.")
+            raise InputError(f"--kept-structure is {self.kept_structure:g}; give a number from 0 to 1.")
         if not 0.0 < self.object_style < math.inf:
             raise InputError(f"--pipeline.object-style is {self.object_style}; give a number above 0.")
         if not any(self.loss_weights.values()):
