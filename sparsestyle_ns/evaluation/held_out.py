@@ -207,8 +207,8 @@ class StyleFigures:
         `style_loss` and `content_loss` are Eq. 5's: nearest neighbour feature matching, and the features' distance from
         the unstylised view; other losses of `targets` are `NAME_loss`, `gram_distance` is that of `metrics.image`,
         `features_used` is the share of the painting's feature vectors, or where a view has fewer, of as many, that are
-        the most similar one of some place; `stroke_width` is that of `metrics.strokes` in pixels, and the rest are of
-        `StyleDistance`. With `accumulation`, only where the scene covers the picture: a background can't be stylised.
+        the most similar one of some place; `stroke_width` is that of `metrics.strokes` in pixels, `unstylised_ssim` the
+        SSIM to the unstylised view, and the rest are of `StyleDistance`. With `accumulation`, only where the scene covers the picture: a background can't be stylised.
         """
         content, figures = self.targets.content(coarse), {}
         for suffix, picture in (("_before", coarse), ("", stylised)):
@@ -221,6 +221,7 @@ class StyleFigures:
                 chosen = nearest_neighbors(view.features, self.index)
                 found["features_used"] = len(chosen.unique()) / min(len(chosen), self.num_features)
             figures |= {f"{name}{suffix}": value for name, value in found.items()}
+        figures["unstylised_ssim"] = structural_similarity(stylised, coarse)
         for name in ("content", "structure"):  # what keeps a view like its content, which it is before
             figures.pop(f"{name}_loss_before", None)
         return figures

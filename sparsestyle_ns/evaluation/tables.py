@@ -27,7 +27,7 @@ LABELS: Dict[str, Tuple[str, int]] = {
     "art_fid": ("ArtFID ↓", 2),
     "content_loss": ("feature distance to the content ↓", 3),
     "content_ssim": ("SSIM to the photo ↑", 3),
-    "unstylised_ssim": ("SSIM to the unstylised frame ↑", 3),
+    "unstylised_ssim": ("SSIM to the unstylised view ↑", 3),
     "baked_psnr": ("baked to exact, PSNR dB ↑", 1),
 }
 """A figure's name in words, with the direction that is better, and its decimals."""
@@ -111,7 +111,7 @@ def report_tables(means: Dict[str, float], num_views: int) -> List[Table]:
     if not prefix:
         return tables
     style = [(key, key, "") for key in STYLE]
-    kept = [(key, key, "") for key in ("art_fid", "content_loss", "content_ssim", "baked_psnr")]
+    kept = [(key, key, "") for key in ("art_fid", "content_loss", "unstylised_ssim", "content_ssim", "baked_psnr")]
     before = {key: means.get(f"{key}_before") for key in STYLE}
     rows = [("unstylised", before), ("stylised", means)]
     tables.append(table_of(f"Style, {views}", style, rows))

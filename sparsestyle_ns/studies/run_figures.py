@@ -17,7 +17,7 @@ from sparsestyle_ns.core.camera_paths import measuring_path
 from sparsestyle_ns.engine.loading import evaluate_run, load_run
 from sparsestyle_ns.evaluation.held_out import PathFrames, StyleFigures, render_path, saved_report
 from sparsestyle_ns.metrics.art_fid import ArtFID, missing_weights
-from sparsestyle_ns.metrics.image import has_lpips, structural_similarity
+from sparsestyle_ns.metrics.image import has_lpips
 from sparsestyle_ns.pipelines.hier_style import HierStylePipelineConfig
 from sparsestyle_ns.runs.checkpoints import CHECKPOINT_FOLDER, checkpoint_step, newest_checkpoint
 from sparsestyle_ns.runs.run_folder import REPORT_FILE
@@ -39,7 +39,7 @@ class RunFigures:
     """What a row of a table shows."""
 
     figures: Dict[str, float]
-    """As `PathFrames.figures` and `StyleFigures` name them, and `unstylised_ssim`."""
+    """As `PathFrames.figures` and `StyleFigures` name them."""
     pictures: List[Path]
     """PNG files of the path's first, middle and last frame."""
     coarse_pictures: List[Path] = field(default_factory=list)
@@ -62,8 +62,7 @@ class PaintingMeasure:
         for index in track(range(0, len(frames.stylised), STYLE_EVERY), "Style and content"):
             stylised, coarse = frames.stylised[index], frames.coarse[index]
             covered = frames.surfaces[index].covered.float()
-            figures = self._style.of(coarse, stylised, covered)
-            values.append({**figures, "unstylised_ssim": structural_similarity(stylised, coarse)})
+            values.append(self._style.of(coarse, stylised, covered))
             if art_fid is not None:
                 art_fid.add(stylised, coarse)
         means = {key: sum(value[key] for value in values) / len(values) for key in values[0]}
