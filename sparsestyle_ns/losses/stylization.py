@@ -94,7 +94,7 @@ class StyleTargets:
         with torch.no_grad():
             rows = self.style_rows()
             rows = rows if style_features is None else sample_rows(rows, style_features)
-            painting = PaintingFeatures(style_image, rows)
+            painting = PaintingFeatures(self.style_picture, rows)
             self.by_name = {name: LOSSES[name](painting) for name in losses}
 
     def features(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 C h w"]:

@@ -10,7 +10,10 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class PaintingFeatures:
-    """A painting as losses see it: RGB in [0, 1], and its feature vectors, one a row."""
+    """A painting as losses see it: RGB in [0, 1] at the size at which the network sees it, and its feature vectors.
+
+    The size matters: reduced, thin lines are less dark, and a painting's colours lie closer together.
+    """
 
     image: Float[Tensor, "3 H W"]
     rows: Float[Tensor, "rows C"]

@@ -68,3 +68,13 @@ def test_a_sample_of_rows_keeps_their_order_and_repeats_none():
     assert len(drawn.unique()) == 30
     assert drawn.equal(drawn.sort().values)
     assert drawn.equal(sample_rows(rows, 30).flatten())
+
+
+def test_colours_are_compared_with_the_painting_as_large_as_the_network_sees_it():
+    black_and_white = (torch.arange(64)[:, None] + torch.arange(64)) % 2.0
+    targets = StyleTargets(Patches(), black_and_white.expand(3, -1, -1), feature_side=16, losses=["colors"])
+    losses = [
+        float(targets.losses(targets.view(image, targets.content(image)))["colors"])
+        for image in (torch.full((16, 16, 3), 0.5), black_and_white[:16, :16, None].expand(-1, -1, 3))
+    ]
+    assert losses[0] < 0.01 * losses[1]
