@@ -36,8 +36,8 @@ def structure_loss(
 ) -> Float[Tensor, ""]:
     """max(0, kept − SSIM) of the brightness of pictures in [0, 1], in [0, 1 + kept].
 
-    `kept` is in [0, 1], and 0 there where pictures aren't opposites. SSIM is a mean over covered pixels; over all
-    where none is, or without `covered`. The second picture gets no gradient.
+    `kept` is in [0, 1]. SSIM (Wang et al. 2004) is a mean over covered pixels; over all where none is, or without
+    `covered`. The second picture gets no gradient.
 
     Example:
         >>> picture = torch.rand(20, 20, 3)
