@@ -208,8 +208,8 @@ class StyleFigures:
         the unstylised view; other losses of `targets` are `NAME_loss`, `gram_distance` is that of `metrics.image`,
         `features_used` is the share of the painting's feature vectors, or where a view has fewer, of as many, that are
         the most similar one of some place; `stroke_width` is that of `metrics.strokes` in pixels, `unstylised_ssim` the
-        SSIM to the unstylised view, and the rest are of `StyleDistance`. With `accumulation`, only where the scene
-        covers the picture: a background can't be stylised.
+        SSIM to the unstylised view, both of the whole picture, and the rest are of `StyleDistance`. With `accumulation`
+        all else is of where the scene covers the picture: a background can't be stylised.
         """
         content, figures = self.targets.content(coarse), {}
         for suffix, picture in (("_before", coarse), ("", stylised)):

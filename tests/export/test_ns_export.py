@@ -14,7 +14,7 @@ from sparsestyle_ns.pipelines.command_output import claim_output
 from sparsestyle_ns.pipelines.export_command import check_box, check_export
 from sparsestyle_ns.utils.errors import InputError
 
-pytest.importorskip("open3d", exc_type=ImportError, reason="Open3D can't be loaded on this machine")
+pytest.importorskip("open3d", exc_type=ImportError)  # which names the library that it lacks
 
 
 @pytest.mark.parametrize("what", ["pointcloud", "poisson"])
