@@ -43,7 +43,7 @@ class HierStyleModelConfig(FineFieldConfig, SceneModelConfig):
     num_samples: Optional[int] = 4
     """Samples a ray on which the stylised field learns, where the coarse field's weight is; None: every step that can
     show, as with a fine-tuned copy of the coarse field, whose weight moves."""
-    num_eval_samples: Optional[int] = 5
+    num_eval_samples: Optional[int] = 4
     """The same in pictures; more of them show fewer ripples where colour changes along rays."""
     even_share: float = 0.2
     """Where residual density may add to the geometry, this share of all samples, in [0, 1), lies evenly besides."""

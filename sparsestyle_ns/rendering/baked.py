@@ -22,11 +22,11 @@ from torch import Tensor, nn
 from sparsestyle_ns.core import spaces
 from sparsestyle_ns.core.occupancy import Occupancy
 from sparsestyle_ns.core.precision import Precision, autocast
-from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.spaces import Segments, Space
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.rendering import baked_kernels
+from sparsestyle_ns.rendering.lines import RAYS_PER_PART, Lines, lines_of
 from sparsestyle_ns.rendering.mixing import STYLISED, Appearance, Mix, mixed
 from sparsestyle_ns.rendering.render import POINTS_PER_CALL, Background, PackedRender, composite, render_packed
 from sparsestyle_ns.rendering.visible_samples import Marching, visible_samples
@@ -55,8 +55,6 @@ MOST_BAKED = 4
 """Styles whose volumes are kept."""
 MOST_CLEARANCE = 16
 """Cells of empty space that are crossed in one leap, at most."""
-RAYS_PER_PART = 512
-"""Rays that a thread marches before it takes the next part: they end early or late, and threads shouldn't wait."""
 
 
 def encode(values: Float[Tensor, "points 8"]) -> UInt8[Tensor, "points 8"]:
@@ -202,9 +200,10 @@ def render_baked(
     volumes: Sequence[BakedVolume], segments: Segments, marching: Marching, background: Background, mix: Mix = STYLISED
 ) -> Tuple[PackedRender, PackedRender]:
     """The render of a mixture of one or two styles, which share coarse field and resolution, and the coarse render."""
-    is_cut = isinstance(segments, spaces.ContractedSegments) and segments.ends is not None
-    march = march_compiled if volumes[0].codes.device.type == "cpu" and not is_cut else march_in_torch
-    return march(volumes, segments, marching, background, mix)
+    lines = lines_of(segments, marching.num_steps, marching.unbounded)
+    if lines is None:
+        return march_in_torch(volumes, segments, marching, background, mix)
+    return march_compiled(volumes, lines, marching, background, mix)
 
 
 @torch.no_grad()
@@ -222,10 +221,9 @@ def march_in_torch(
 
 @torch.no_grad()
 def march_compiled(
-    volumes: Sequence[BakedVolume], segments: Segments, marching: Marching, background: Background, mix: Mix = STYLISED
+    volumes: Sequence[BakedVolume], lines: Lines, marching: Marching, background: Background, mix: Mix = STYLISED
 ) -> Tuple[PackedRender, PackedRender]:
     """`render_baked` on a CPU: rays are marched until none has come by a voxel that isn't filled."""
-    lines = _lines(segments, marching)
     left = torch.arange(len(lines.hit))
     sums = torch.zeros(len(left), 10)
     shares = tuple(map(np.float32, (mix.density_share, mix.strength, mix.blend)))
@@ -249,26 +247,6 @@ def _voxels(volume: BakedVolume, occupancy: Optional[Occupancy]) -> baked_kernel
         volume.codes.numpy().view("<u8").squeeze(-1),
         volume.resolution,
         *map(np.float32, (DENSITY_UNIT, DENSITY_STEP, ROUNDING)),
-    )
-
-
-def _lines(segments: Segments, marching: Marching) -> baked_kernels.Lines:
-    spaced, bent = torch.zeros(2), isinstance(segments, spaces.ContractedSegments)
-    if bent:
-        parts = segments.origins, segments.directions
-        ends = spaces.spacing(torch.tensor([segments.near, spaces.MAX_DISTANCE]))
-        spaced = torch.stack([ends[0], ends[1] - ends[0]])
-    elif isinstance(segments, spaces.LinearSegments):
-        parts = segments.start, segments.extent
-    else:
-        raise TypeError(f"{type(segments).__name__} has no compiled form; use march_in_torch.")
-    return baked_kernels.Lines(
-        values=torch.cat(parts, dim=-1).float().numpy(),
-        hit=segments.hit.numpy(),
-        bent=bent,
-        unbounded=marching.unbounded,
-        spaced=spaced.numpy(),
-        edges=even_edges(1, marching.num_steps, segments.hit.device)[0].numpy(),
     )
 
 

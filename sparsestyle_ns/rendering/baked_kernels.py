@@ -8,8 +8,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from sparsestyle_ns.core.spaces import MAX_DISTANCE
 from sparsestyle_ns.core.volrend import MAX_OPTICAL_DEPTH
+from sparsestyle_ns.rendering.lines import exponential, length_between, point_at, scaled
 from sparsestyle_ns.utils.numba_kernels import inlined, kernel
 
 LOOKAHEAD = 6
@@ -23,28 +23,7 @@ _DEPTH_CAP = np.float32(MAX_OPTICAL_DEPTH)
 _UNSEEN = np.float32(2e-4)  # of a ray's weight: with less, a sample has no colour, only opacity
 _ENDLESS, _FARTHEST = np.float32(np.inf), np.float32(1e6)
 _CAREFUL = np.float32(2 * 0.999)  # the cube's side, but for rounding
-_LEAST_DISPARITY = np.float32(0.5 / MAX_DISTANCE)
 _BYTE, _NO_BYTE = np.uint64(255), np.uint64(0)
-_LOG2_E, _LN2_HIGH, _LN2_LOW = np.float32(1.4426950), np.float32(0.693359375), np.float32(-2.1219444e-4)
-_TERMS = tuple(np.float32(1.0 / factorial) for factorial in (2, 6, 24, 120, 720))
-_BIAS, _MANTISSA = np.int32(127), np.int32(23)  # of a float32's exponent; and bits below it
-
-
-class Lines(NamedTuple):
-    """Rays, in the two forms that segments have."""
-
-    values: np.ndarray
-    """Six numbers a ray: start and extent of a straight segment in field coordinates, or origin, in the contraction's
-    unit, and direction of a ray that it bends."""
-    hit: np.ndarray
-    """Whether a ray meets the scene."""
-    bent: bool
-    unbounded: bool
-    """Whether the last interval is infinite."""
-    spaced: np.ndarray
-    """For bent rays, g of the distance at s = 0, and how much further g is at s = 1."""
-    edges: np.ndarray
-    """Borders of the samples in s, the same for every ray."""
 
 
 class Voxels(NamedTuple):
@@ -63,40 +42,11 @@ class Voxels(NamedTuple):
 
 
 @inlined
-def _point(lines, line, s):
-    """Field coordinates at s of a ray, given by its six numbers."""
-    if not lines.bent:
-        return line[0] + s * line[3], line[1] + s * line[4], line[2] + s * line[5]
-    spaced = lines.spaced[0] + s * lines.spaced[1]
-    distance = spaced + spaced if spaced < _HALF else _HALF / max(_ONE - spaced, _LEAST_DISPARITY)
-    x, y, z = line[0] + distance * line[3], line[1] + distance * line[4], line[2] + distance * line[5]
-    norm = max(abs(x), abs(y), abs(z))
-    scale = _HALF if norm < _ONE else (_ONE - _HALF / norm) / norm
-    return x * scale, y * scale, z * scale
-
-
-@inlined
-def _length(lines, line, sample):
-    """δ of a sample, in field coordinates."""
-    x0, y0, z0 = _point(lines, line, lines.edges[sample])
-    x1, y1, z1 = _point(lines, line, lines.edges[sample + 1])
-    x, y, z = x1 - x0, y1 - y0, z1 - z0
-    return np.sqrt(x * x + y * y + z * z)
-
-
-@inlined
-def _scaled(coordinate, size):
-    """Where a coordinate lies on an axis of `size` units; outside of the cube (and for NaN) at its border."""
-    share = _HALF * coordinate + _HALF
-    return np.float32(size) * (min(share, _ONE) if share > _ZERO else _ZERO)
-
-
-@inlined
 def _empty_steps(clearance, x, y, z, length):
     """How many steps of a length, from this point on, surely lie in empty cells; 0 in an occupied one."""
     size = clearance.shape[0]
     last = np.uint32(size - 1)
-    i, j, k = np.uint32(_scaled(x, size)), np.uint32(_scaled(y, size)), np.uint32(_scaled(z, size))
+    i, j, k = np.uint32(scaled(x, size)), np.uint32(scaled(y, size)), np.uint32(scaled(z, size))
     cells = clearance[np.uintp(min(i, last)), np.uintp(min(j, last)), np.uintp(min(k, last))]
     if cells <= 1:
         return int(cells)
@@ -198,25 +148,11 @@ def _mean(typing_context, words, weights):
 
 
 @inlined
-def _exp(x):
-    """e^x for x from -87 to 88, to 3e-7 of it: a polynomial of what is left of a power of 2 (Cody and Waite 1980)."""
-    power = np.floor(x * _LOG2_E + _HALF)
-    rest = (x - power * _LN2_HIGH) - power * _LN2_LOW
-    square = rest * rest
-    series = (
-        _ONE
-        + rest
-        + square * (_TERMS[0] + rest * _TERMS[1] + square * (_TERMS[2] + rest * _TERMS[3] + square * _TERMS[4]))
-    )
-    return series * np.int32((np.int32(power) + _BIAS) << _MANTISSA).view(np.float32)
-
-
-@inlined
 def _density(voxels, code):
     """The density that has this code."""
     if code - _ONE <= voxels.rounding:
         return _ZERO
-    return voxels.unit * (_exp(voxels.step * (code - _ONE)) - _ONE)
+    return voxels.unit * (exponential(voxels.step * (code - _ONE)) - _ONE)
 
 
 @inlined
@@ -224,7 +160,7 @@ def _transmitted(density, length, infinite):
     """exp(−τ) of a sample."""
     if density <= _ZERO:
         return _ONE
-    return _exp(-_DEPTH_CAP if infinite else -min(density * length, _DEPTH_CAP))
+    return exponential(-_DEPTH_CAP if infinite else -min(density * length, _DEPTH_CAP))
 
 
 @inlined
@@ -257,14 +193,14 @@ def march_rays(rays, start, end, lines, voxels, second, shares, min_transmittanc
         r, g, b, opacity, moment = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
         coarse_r, coarse_g, coarse_b, coarse_opacity, coarse_moment = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
         light, coarse_light = _ONE, _ONE
-        length = _length(lines, line, 0)
+        length = length_between(lines, line, lines.edges[0], lines.edges[1])
         following = 0
         while following <= last:
             sample, following = following, following + 1
             if coarse_light <= min_transmittance or lacking == LOOKAHEAD:
                 break
             s = middles[sample]
-            x, y, z = _point(lines, line, s)
+            x, y, z = point_at(lines, line, s)
             infinite = lines.unbounded and sample == last
             if not infinite:
                 empty = _empty_steps(voxels.clearance, x, y, z, _ENDLESS if lines.bent else length)
@@ -273,7 +209,7 @@ def march_rays(rays, start, end, lines, voxels, second, shares, min_transmittanc
                     if lines.unbounded:
                         following = min(following, last)
                     continue
-            u, v, w = _scaled(x, top), _scaled(y, top), _scaled(z, top)
+            u, v, w = scaled(x, top), scaled(y, top), scaled(z, top)
             i, j, k = min(int(u), top - 1), min(int(v), top - 1), min(int(w), top - 1)
             fu, fv, fw = u - np.float32(i), v - np.float32(j), w - np.float32(k)
             words, near = _words(voxels, i, j, k), _corner_weights(fu, fv, fw)
@@ -291,7 +227,7 @@ def march_rays(rays, start, end, lines, voxels, second, shares, min_transmittanc
                 lacking += 1
                 continue
             if lines.bent:
-                length = _length(lines, line, sample)
+                length = length_between(lines, line, lines.edges[sample], lines.edges[sample + 1])
             left = _transmitted(density, length, infinite)
             coarse_weight = coarse_light * (_ONE - left)
             coarse_light *= left

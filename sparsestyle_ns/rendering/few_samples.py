@@ -12,15 +12,19 @@ which a share of them is spread evenly.
 from dataclasses import dataclass
 from typing import NamedTuple, Optional, Tuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sparsestyle_ns.core.occupancy import DensityVolume, Occupancy, PackedSamples
 from sparsestyle_ns.core.sampling import even_edges, sample_pdf
 from sparsestyle_ns.core.spaces import Segments
 from sparsestyle_ns.core.volrend import dense_weights, optical_depth
+from sparsestyle_ns.rendering import few_samples_kernels
+from sparsestyle_ns.rendering.lines import RAYS_PER_PART, Lines, lines_of
+from sparsestyle_ns.utils.numba_kernels import even_parts, run_on_threads
 
 LEAST_WEIGHT = 1e-4
 """Stretches, and rays, with less weight than this have no sample where nothing can be added to them."""
@@ -75,6 +79,53 @@ def cut_into_stretches(
     It is looked at on `num_steps` even steps, and then on `FINE_STEPS` that lie where the weight is: on even steps
     alone, neighbouring pixels see a surface in different steps, which shows as ripples like the grain of wood.
     """
+    lines = lines_of(segments, num_steps, unbounded)
+    if lines is None:
+        is_kept, *values = _cut_in_torch(segments, few, num_steps, unbounded, occupancy)
+    else:
+        is_kept, *values = _cut_compiled(lines, few, occupancy)
+    # Where they are is asked for once: a GPU is waited for with every mask.
+    kept = is_kept.nonzero(as_tuple=True)
+    s, lengths, depth = (each[kept] for each in values)
+    return Stretches(PackedSamples(kept[0], s, lengths, segments.positions(s, kept[0])), depth)
+
+
+class _Cut(NamedTuple):
+    """All stretches of rays."""
+
+    is_kept: Bool[Tensor, "rays samples"]
+    """Whether they have a sample; what else is said of one without may be anything."""
+    s: Float[Tensor, "rays samples"]
+    lengths: Float[Tensor, "rays samples"]
+    depth: Float[Tensor, "rays samples"]
+    """By the volume."""
+
+
+def _cut_compiled(lines: Lines, few: FewSamples, occupancy: Optional[Occupancy]) -> _Cut:
+    num_rays, count = len(lines.hit), few.count + lines.unbounded
+    is_kept = torch.zeros(num_rays, count, dtype=torch.bool)
+    results = [torch.zeros(num_rays, count) for _ in range(3)]
+    look = few_samples_kernels.Look(
+        few.volume.log_density.numpy(),
+        np.ones((1, 1, 1), dtype=bool) if occupancy is None else occupancy.occupied.numpy(),
+        FINE_STEPS,
+        np.float32(FINE_EVEN_SHARE),
+        ROUNDS,
+        np.float32(max(few.even_share, LEAST_EVEN_SHARE)),
+        np.float32(SHARE_WITHIN),
+        np.float32(LEAST_WEIGHT if few.even_share == 0.0 else -1.0),
+        np.float32(TINY),
+    )
+    arrays = lines, look, np.float32(LEAST_WEIGHT), is_kept.numpy(), *(each.numpy() for each in results)
+    parts = even_parts(num_rays, -(-num_rays // RAYS_PER_PART))
+    run_on_threads(few_samples_kernels.cut_rays, [(*part, *arrays) for part in parts])
+    return _Cut(is_kept, *results)
+
+
+def _cut_in_torch(
+    segments: Segments, few: FewSamples, num_steps: int, unbounded: bool, occupancy: Optional[Occupancy]
+) -> _Cut:
+    """The same on any device."""
     edges = even_edges(len(segments.hit), num_steps, segments.hit.device)
     end = 0.5 * (edges[:, -2:-1] + edges[:, -1:])
     if unbounded:  # the last step is endless, and has a sample of its own
@@ -96,10 +147,7 @@ def cut_into_stretches(
         reached = segments.hit[:, None] & (torch.exp(-depth.sum(dim=-1, keepdim=True)) > LEAST_WEIGHT)
         is_kept, s = torch.cat([is_kept, reached], dim=-1), torch.cat([s, end], dim=-1)
         depth, lengths = F.pad(depth, (0, 1)), F.pad(lengths, (0, 1), value=torch.inf)
-    # Where they are is asked for once: a GPU is waited for with every mask.
-    kept = is_kept.nonzero(as_tuple=True)
-    s, lengths, depth = (values[kept] for values in (s, lengths, depth))
-    return Stretches(PackedSamples(kept[0], s, lengths, segments.positions(s, kept[0])), depth)
+    return _Cut(is_kept, s, lengths, depth)
 
 
 def _looked_at(

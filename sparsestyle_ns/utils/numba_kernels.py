@@ -49,7 +49,7 @@ def run_on_threads(function: Callable[..., None], parts: Sequence[Tuple]) -> Non
 
 def even_parts(length: int, count: int) -> Sequence[Tuple[int, int]]:
     """(start, end) of at most `count` runs of nearly the same length that together cover `length`; none is empty."""
-    size = max(1, -(-length // count))
+    size = max(1, -(-length // max(count, 1)))
     return [(start, min(start + size, length)) for start in range(0, length, size)]
 
 

@@ -71,6 +71,8 @@ ELSEWHERE = {
     "sparsestyle_ns.losses.style_index.check_style": "refuses, and returns nothing: test_nnfm.py",
     "sparsestyle_ns.style.backbones": "reads weight files: test_vgg.py",
     "sparsestyle_ns.field_components.tiny_cuda_grid.has_tiny_cuda_nn": "asks what is installed: test_hier_style.py",
+    "sparsestyle_ns.rendering.few_samples_kernels.cut_rays": "is what cut_into_stretches calls on a CPU",
+    "sparsestyle_ns.rendering.lines": "takes segments, and parts of kernels are compiled in them: test_lines.py",
     "sparsestyle_ns.rendering.few_samples": "takes a volume of a field's densities: test_few_samples.py",
     "sparsestyle_ns.rendering.render.frozen_field": "is what freeze_samples and render_frozen call",
     "sparsestyle_ns.rendering.render.render_frozen": "takes a volume of a field's densities: test_few_samples.py",

@@ -4,7 +4,7 @@ from nerfstudio.data.scene_box import SceneBox
 from torch.nn.functional import normalize
 
 from sparsestyle_ns.core.occupancy import Occupancy, march
-from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace, Segments
+from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
@@ -16,7 +16,6 @@ from sparsestyle_ns.rendering.baked import (
     clearance_of,
     decode,
     encode,
-    march_compiled,
     march_in_torch,
     render_baked,
 )
@@ -32,7 +31,8 @@ SPACES = {
     "ndc": ForwardFacingSpace(CUBE, (2.0, 2.0), near=1.0, depth_range=(1.5, 9.0)),
 }
 WHITE = torch.ones(3)
-MARCHES = [march_compiled, march_in_torch]
+MARCHES = [render_baked, march_in_torch]
+"""On a CPU the first is compiled."""
 
 
 def rays_of(space, count=60):
@@ -174,8 +174,8 @@ def test_the_compiled_march_is_the_one_in_torch(space, min_transmittance, cells,
     rays = bundle(space, occupancy, min_transmittance)
     one, other = volume_of(fields), volume_of(fields)
     # The same codes, added up in another order.
-    assert_renders(march_compiled([one], *rays, WHITE), march_in_torch([other], *rays, WHITE), tolerance=2e-6)
-    assert_renders(march_compiled([other], *rays, WHITE), march_in_torch([one], *rays, WHITE), tolerance=2e-6)
+    assert_renders(render_baked([one], *rays, WHITE), march_in_torch([other], *rays, WHITE), tolerance=2e-6)
+    assert_renders(render_baked([other], *rays, WHITE), march_in_torch([one], *rays, WHITE), tolerance=2e-6)
 
 
 def test_clearance_is_the_distance_to_the_nearest_occupied_cell_and_follows_the_cells():
@@ -285,9 +285,9 @@ def test_outside_of_the_cube_its_border_counts(march):
 def test_a_ray_that_is_no_number_does_no_harm(fields):
     origins, directions = rays_of("box")
     origins[3], directions[5] = torch.nan, torch.nan
-    found, _ = march_compiled([volume_of(fields)], *bundle("box", rays=(origins, directions)), None)
+    found, _ = render_baked([volume_of(fields)], *bundle("box", rays=(origins, directions)), None)
     rest = torch.arange(60)[[index not in (3, 5) for index in range(60)]]
-    whole, _ = march_compiled([volume_of(fields)], *bundle("box"), None)
+    whole, _ = render_baked([volume_of(fields)], *bundle("box"), None)
     assert torch.equal(found.rgb[rest], whole.rgb[rest])
 
 
@@ -305,18 +305,9 @@ def test_memory_grows_with_the_bricks_that_rays_have_met_up_to_the_whole_cube():
 
 def test_a_picture_of_no_rays_is_empty(fields):
     rays = bundle("box", rays=(torch.zeros(0, 3), torch.zeros(0, 3)))
-    assert march_compiled([volume_of(fields)], *rays, None)[0].rgb.shape == (0, 3)
+    assert render_baked([volume_of(fields)], *rays, None)[0].rgb.shape == (0, 3)
 
 
 def test_a_volume_without_cells_is_refused():
     with pytest.raises(ValueError, match="bake_resolution"):
         volume_of(trilinear, 0)
-
-
-def test_segments_of_another_kind_have_no_compiled_form():
-    class Spiral(Segments):
-        hit = torch.ones(1, dtype=torch.bool)
-        positions = lengths = distance = at_distance = _part = None
-
-    with pytest.raises(TypeError, match="march_in_torch"):
-        march_compiled([volume_of(trilinear)], Spiral(), Marching(None, STEPS, False, 0.0), None)

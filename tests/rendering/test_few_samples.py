@@ -1,6 +1,7 @@
 """A few samples a ray, against their twin: every step, with the field asked at each."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,12 +9,14 @@ from nerfstudio.data.scene_box import SceneBox
 from test_baked import rays_of
 from test_render import RacingSums
 
-from sparsestyle_ns.core.occupancy import DensityVolume
+from sparsestyle_ns.core.occupancy import DensityVolume, Occupancy
 from sparsestyle_ns.core.spaces import BoxSpace, ContractedSpace, ForwardFacingSpace
 from sparsestyle_ns.field_components.hash_grid import HashGrid
 from sparsestyle_ns.fields.coarse import CoarseField
 from sparsestyle_ns.fields.residual import ResidualField
+from sparsestyle_ns.rendering import few_samples
 from sparsestyle_ns.rendering.few_samples import MOST_CORRECTION, FewSamples, Stretches, cut_into_stretches
+from sparsestyle_ns.rendering.lines import lines_of
 from sparsestyle_ns.rendering.render import (
     FrozenSamples,
     accumulation_of,
@@ -77,6 +80,13 @@ class Scene:
         assert expected.std(dim=0).mean() > 0.01  # there is something to see
         psnr = -10 * math.log10((rgb - expected).square().mean().item())
         return psnr, ((gradient - wanted).norm() / wanted.norm()).item()
+
+
+@pytest.fixture(autouse=True, params=["compiled", "torch"])
+def way(request, monkeypatch):
+    """All that is said here holds for the kernel and for what other devices have."""
+    if request.param == "torch":
+        monkeypatch.setattr(few_samples, "lines_of", lambda *_: None)
 
 
 @pytest.fixture(scope="module")
@@ -291,3 +301,45 @@ def test_batches_that_are_joined_are_the_samples_of_all_rays_at_once(scene):
     pictures = (render_stylised(scene.residual, frozen, BACKGROUND).rgb for frozen in (joined, whole))
     torch.testing.assert_close(*pictures, rtol=0, atol=1e-5)
     assert FrozenSamples.joined([whole], scene.residual) is whole
+
+
+@pytest.mark.parametrize("count", [1, 4, 16])
+@pytest.mark.parametrize("fields", ["scene", "moving"])
+@EACH_SPACE
+def test_the_kernel_cuts_rays_as_torch_does(space, fields, count, request, monkeypatch):
+    few = request.getfixturevalue(fields).few(count)
+    segments, unbounded = SPACES[space].segments(*rays_of(space, 300)), SPACES[space].unbounded
+    found = []
+    for form in (lines_of, lambda *_: None):
+        monkeypatch.setattr(few_samples, "lines_of", form)
+        found.append(cut_into_stretches(segments, few, STEPS, unbounded))
+    (samples, depth), (expected, expected_depth) = found
+    assert torch.equal(samples.ray_indices, expected.ray_indices)
+    torch.testing.assert_close(samples.lengths, expected.lengths, atol=1e-4, rtol=0)
+    torch.testing.assert_close(depth, expected_depth, atol=1e-3, rtol=1e-3)
+    # Where hardly any weight lies, its middle is a matter of rounding.
+    torch.testing.assert_close(samples.s, expected.s, atol=2e-3, rtol=0)
+    assert (samples.s - expected.s).abs().median() < 1e-6
+
+
+@EACH_SPACE
+def test_the_kernel_passes_over_empty_cells_as_torch_does(space, scene, monkeypatch):
+    occupancy = Occupancy(12)
+    torch.manual_seed(1)
+    occupancy.occupied.copy_(torch.rand(12, 12, 12) < 0.2)
+    segments = SPACES[space].segments(*rays_of(space, 300))
+    marching = Marching(occupancy, STEPS, SPACES[space].unbounded, 0.0, scene.few(8))
+
+    def picture(marching):
+        frozen = freeze_samples(scene.coarse, scene.residual, segments, marching)
+        return render_stylised(scene.residual, frozen, BACKGROUND).rgb
+
+    found = []
+    for form in (lines_of, lambda *_: None):
+        monkeypatch.setattr(few_samples, "lines_of", form)
+        found.append(picture(marching))
+    # A step within rounding of a cell's border may lie on either side of it.
+    errors = (found[0] - found[1]).abs()
+    assert errors.max() < 0.05
+    assert errors.median() < 1e-5
+    assert (picture(replace(marching, occupancy=None)) - found[0]).abs().mean() > 20 * errors.mean()
