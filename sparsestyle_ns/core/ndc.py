@@ -33,7 +33,8 @@ def ndc_rays(
     its origin. `focal_over_half_size` is (2f/w, 2f/h), and `near` is n > 0. The third result says which rays point
     forward: mask what is computed from the others.
     """
-    slope, _, valid = _forward(directions)
+    forward_z, valid = _forward(directions)
+    slope = torch.where(valid, directions[..., :2], 0.0) / forward_z
     crossing = origins[..., :2] - (near + origins[..., 2:]) * slope
     scale_x, scale_y = focal_over_half_size
     one = torch.ones_like(crossing[..., 0])
@@ -50,7 +51,7 @@ def ndc_distance(
     In units of the direction's length; negative where the point lies behind the origin, and at most `max_distance`,
     which is the result, without a gradient, where t' >= 1.
     """
-    _, forward_z, _ = _forward(directions)
+    forward_z, _ = _forward(directions)
     infinite = t_ndc >= 1
     z = -near / torch.where(infinite, 1.0, 1 - t_ndc)
     distance = (z - origins[..., 2:]) / forward_z
@@ -62,14 +63,13 @@ def ndc_parameter(distance: Numbers, origins: Vectors, directions: Vectors, near
 
     A point on or behind the camera plane counts as just before it.
     """
-    _, forward_z, _ = _forward(directions)
+    forward_z, _ = _forward(directions)
     z = origins[..., 2:] + distance * forward_z
     return 1.0 + near / z.clamp(max=-MIN_FORWARD * near)
 
 
-def _forward(directions: Vectors) -> tuple[Float[Tensor, "*batch 2"], Numbers, Bool[Tensor, "*batch 1"]]:
-    """(d_x/d_z, d_y/d_z), d_z, and which rays point forward; the others get the values of direction (0, 0, -1)."""
+def _forward(directions: Vectors) -> tuple[Numbers, Bool[Tensor, "*batch 1"]]:
+    """d_z, and which rays point forward; the others get the value of direction (0, 0, -1)."""
     z = directions[..., 2:]
     valid = z < -MIN_FORWARD * directions.detach().abs().amax(dim=-1, keepdim=True)
-    forward_z = torch.where(valid, z, -1.0)
-    return torch.where(valid, directions[..., :2], 0.0) / forward_z, forward_z, valid
+    return torch.where(valid, z, -1.0), valid

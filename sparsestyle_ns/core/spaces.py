@@ -36,7 +36,7 @@ class Segments(ABC):
         """Length in field coordinates between neighbouring borders."""
 
     @abstractmethod
-    def distance(self, s: Float[Tensor, "rays 1"]) -> Float[Tensor, "rays 1"]:
+    def distance(self, s: Float[Tensor, "rays points"]) -> Float[Tensor, "rays points"]:
         """Distance from the ray's origin in world units, at most `MAX_DISTANCE` of the scene's."""
 
     @abstractmethod

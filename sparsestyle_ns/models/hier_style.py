@@ -207,13 +207,14 @@ class HierStyleModel(SceneModel):
             frozen = self._freeze(parts, marching)
             with autocast(self.device, self.config.precision):
                 fine, coarse = render.render_mixed(self.field, styles, frozen, directions, background, look.mix)
+        depth, depth_coarse = surface_distance(segments, torch.cat([fine.s, coarse.s], dim=-1)).split(1, dim=-1)
         return {
             "rgb": fine.rgb,
             "rgb_coarse": coarse.rgb,
             "accumulation": fine.accumulation,
-            "depth": surface_distance(segments, fine.s),
+            "depth": depth,
             "accumulation_coarse": coarse.accumulation,
-            "depth_coarse": surface_distance(segments, coarse.s),
+            "depth_coarse": depth_coarse,
         }
 
     @torch.no_grad()

@@ -10,7 +10,7 @@ from sparsestyle_ns.core.sampling import even_edges
 from sparsestyle_ns.core.spaces import Segments
 from sparsestyle_ns.utils.numba_kernels import inlined
 
-RAYS_PER_PART = 512
+RAYS_PER_PART = 2048
 """Rays that a thread follows before it takes the next part: they end early or late, and threads shouldn't wait."""
 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)

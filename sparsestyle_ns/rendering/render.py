@@ -78,7 +78,7 @@ def _mean(moment: Float[Tensor, "rays 1"], total: Float[Tensor, "rays 1"]) -> Fl
     return torch.where(total > NO_WEIGHT, moment / total.clamp(min=NO_WEIGHT), 1.0)
 
 
-def surface_distance(segments: Segments, s: Float[Tensor, "rays 1"]) -> Float[Tensor, "rays 1"]:
+def surface_distance(segments: Segments, s: Float[Tensor, "rays points"]) -> Float[Tensor, "rays points"]:
     """Depth pictures: distance of s from the camera, in world units; s = 1 may be infinitely far, so a bit less."""
     return segments.distance(s.clamp(max=1.0 - 1e-4))
 
