@@ -19,6 +19,7 @@ import psutil
 import torch
 from torch import Tensor
 
+from sparsestyle_ns.core.precision import multiplies_bfloat16
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.files import write_whole
 from sparsestyle_ns.utils.machine import BUSY_SHARE, core_seconds, device_name, others_share, synchronize, versions
@@ -277,6 +278,7 @@ class Report:
             **commit(),
             "versions": versions(),
             "device": device_name(self.device),
+            "matrix_products": "bfloat16" if multiplies_bfloat16(self.device) else "float32",
             "threads": self.options.num_threads,
             "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
             "quick": self.options.quick,

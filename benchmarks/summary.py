@@ -18,6 +18,7 @@ BENCHMARKS = (
     "stage2_step",
     "render",
     "before",
+    "before_float32",
     "memory",
 )
 """In the order of the table."""

@@ -169,6 +169,7 @@ def test_a_report_says_what_was_measured_where_and_when(options):
     content = write_report(options)
     assert {"python", "torch", "numpy", "nerfstudio"} <= content["versions"].keys()
     assert content["device"] and content["threads"] == options.num_threads
+    assert content["matrix_products"] in ("bfloat16", "float32")
     assert content["date"].endswith("+00:00")
     assert {"commit", "dirty", "note"} <= content.keys()
     assert content["repetitions"] == {"part": {"ours": {"seconds": [2.0, 2.0]}}}

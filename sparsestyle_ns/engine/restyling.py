@@ -11,7 +11,7 @@ import time
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
-from typing import ContextManager, Dict, Iterator, NamedTuple, Optional, Tuple
+from typing import ContextManager, Dict, Iterator, Mapping, NamedTuple, Optional, Tuple
 
 import torch
 import yaml
@@ -80,17 +80,21 @@ class Workshop:
 class Restyling:
     """One restyling, in steps: `for progress in restyling: …`, then `field` (σ_f and c_f) is the new style.
 
-    Without a number of iterations, as many as the run had, and without a size of strokes, the run's; InputError for
-    less than one iteration.
+    Without a number of iterations, as many as the run had; InputError for less than one. `own` are settings of the
+    pipeline that this style has of its own, such as `stroke_size` and `kept_structure`.
     """
 
     def __init__(
-        self, workshop: Workshop, image: Painting, iterations: Optional[int] = None, stroke_size: Optional[float] = None
+        self,
+        workshop: Workshop,
+        image: Painting,
+        iterations: Optional[int] = None,
+        own: Optional[Mapping[str, float]] = None,
     ) -> None:
         self.workshop, self.pipeline, self.image = workshop, workshop.pipeline, image
         self.config: SparseStyleTrainerConfig = read_config(workshop.folder)  # as it is by now
         self.iterations = self.config.max_num_iterations if iterations is None else iterations
-        self.stroke_size = self.config.pipeline.stroke_size if stroke_size is None else stroke_size
+        self.own = dict(own or {})
         if self.iterations < 1:
             raise InputError(f"A style needs at least 1 iteration, and {self.iterations} were asked for.")
         self._painting = Path(PAINTING_FOLDER) / safe_file_name(self.image.name, "painting")
@@ -106,7 +110,7 @@ class Restyling:
         if pipeline.scene_views is None:
             yield Progress("Preparing the views, which the next style won't need")
         of_style = self.field, self.image, self.workshop.backbone, self.effects
-        task = pipeline.new_task(*of_style, total, self.stroke_size)
+        task = pipeline.new_task(*of_style, total, replace(pipeline.config, **self.own))
         warm_up = pipeline.config.warm_start_steps
         for step in warm_start(pipeline, task, self.optimizers):
             yield Progress(f"Warm start, step {step + 1} of {warm_up}", (step + 1) / (warm_up + total))
@@ -145,7 +149,7 @@ class Restyling:
             config = copy.deepcopy(self.config)
             config.timestamp, config.max_num_iterations = folder.name, self.iterations
             config.load_dir = config.load_step = config.load_checkpoint = None
-            config.pipeline.stroke_size = self.stroke_size
+            config.pipeline = replace(config.pipeline, **self.own)
             config.pipeline.style_image, config.pipeline.decided = folder.resolve() / self._painting, self.effects
             write_whole(new / "config.yml", yaml.dump(config))
             if (record := self._record()) is not None:

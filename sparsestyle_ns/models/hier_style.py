@@ -29,7 +29,7 @@ from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.numba_kernels import untraced
 from sparsestyle_ns.utils.progress import bar
 
-BAKED_RAYS = 1 << 16
+BAKED_RAYS = 1 << 17
 """Rays of a baked picture that are marched at once; a viewer can break it off in between."""
 
 

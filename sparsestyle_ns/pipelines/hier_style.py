@@ -194,25 +194,29 @@ class HierStylePipeline(CheckedPipeline):
         backbone: Backbone,
         effects: Decisions,
         iterations: int,
-        stroke_size: Optional[float] = None,
+        settings: Optional[HierStylePipelineConfig] = None,
     ) -> StyleTask:
         """A field and a painting for the scene's views, which are shared as far as they depend on no painting.
 
-        Strokes are of the config's size unless another is given.
+        `settings` say how the painting is looked at and what is kept of the views; left out, the pipeline's do.
         """
         schedule = self.config.levels(iterations)
         if self.scene_views is None:
             self.scene_views = self.freeze_views()
-        targets = [self.targets_of(painting, backbone, level.scale, stroke_size) for level in schedule]
+        targets = [self.targets_of(painting, backbone, level.scale, settings) for level in schedule]
         scales = [self._share_of_photos(level.scale) for level in schedule]
         views = self.scene_views.for_painting(dict(zip(scales, targets, strict=True)), effects)
         return StyleTask(style, list(map(StyleLevel, schedule, targets, views)))
 
     def targets_of(
-        self, painting: Painting, backbone: Backbone, scale: float = 1.0, stroke_size: Optional[float] = None
+        self,
+        painting: Painting,
+        backbone: Backbone,
+        scale: float = 1.0,
+        settings: Optional[HierStylePipelineConfig] = None,
     ) -> StyleTargets:
         """A painting as the feature network sees it, for views at one of the `view_scales`."""
-        config = self.config if stroke_size is None else replace(self.config, stroke_size=stroke_size)
+        config = settings or self.config
         return config.targets_of(painting, backbone, self.device, self.datamanager.photo_side, scale)
 
     def freeze_views(self) -> SceneViews:

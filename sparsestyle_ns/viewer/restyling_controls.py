@@ -82,17 +82,25 @@ class RestylingControls:
         self.workshop: Optional[Workshop] = None
         self.thread: Optional[threading.Thread] = None
         self._stopping, self._busy, self._pace = threading.Event(), threading.Lock(), Pace()
-        iterations, stroke_size, said = 0, 1.0, ""
+        iterations, stroke_size, kept_structure, said = 0, 1.0, 0.5, ""
         try:
             self.workshop = open_workshop()
             config = read_config(self.workshop.folder)
-            iterations, stroke_size = config.max_num_iterations, config.pipeline.stroke_size
+            iterations, settings = config.max_num_iterations, config.pipeline
+            stroke_size, kept_structure = settings.stroke_size, settings.kept_structure
         except InputError as error:
             said = f"**No restyling.** {plain(str(error))}"
         with gui.add_folder("Another style", expand_by_default=False):
             self.path = gui.add_text("Image", "", hint="path of a picture on the machine that the viewer runs on")
             self.iterations = gui.add_number("Iterations", iterations)
             self.stroke_size = gui.add_slider("Stroke size", *STROKE_SIZES, step=0.1, initial_value=stroke_size)
+            self.kept_structure = gui.add_slider(
+                "Kept structure",
+                *(0.0, 1.0),
+                step=0.05,
+                initial_value=kept_structure,
+                hint="how much of the photos' light and dark views keep at least (SSIM)",
+            )
             gui.add_button("Restyle").on_click(lambda _: self.restyle_path())
             upload = gui.add_upload_button("Upload and restyle", mime_type="image/*")
             upload.on_upload(lambda event: self.restyle_upload(event.target.value.name, event.target.value.content))
@@ -135,7 +143,8 @@ class RestylingControls:
                 raise InputError("This run can't be restyled in this viewer.")
             if not self.is_prepared():
                 raise InputError("The scene is still being prepared for training; try again when it has begun.")
-            restyling = Restyling(self.workshop, painting, int(self.iterations.value), self.stroke_size.value)
+            own = {"stroke_size": self.stroke_size.value, "kept_structure": self.kept_structure.value}
+            restyling = Restyling(self.workshop, painting, int(self.iterations.value), own)
         except Exception as error:  # whatever it is, the viewer goes on
             self._busy.release()
             self.end(f"**Not restyled.** {plain(error_text(error))}")

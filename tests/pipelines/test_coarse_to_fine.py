@@ -4,6 +4,7 @@ import copy
 import math
 import shutil
 from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -182,19 +183,23 @@ def test_restyling_goes_through_the_same_sizes(training, runs, painting, monkeyp
     assert pipeline.scene_views is before
 
 
-def test_a_restyling_with_wider_strokes_leaves_the_other_styles_features_alone(training, runs, painting):
-    pipeline, own = training.pipeline, training.pipeline.task.levels[-1]
-    before = [view.features.clone() for view in own.views]
+def test_a_restyling_with_settings_of_its_own_leaves_the_other_styles_features_alone(training, runs, painting):
+    pipeline, largest = training.pipeline, training.pipeline.task.levels[-1]
+    before = [view.features.clone() for view in largest.views]
     workshop, image = Workshop(pipeline, runs.style, nullcontext()), Painting.read(painting)
-    restyling = Restyling(workshop, image, iterations=5, stroke_size=2.0)
-    new = pipeline.new_task(restyling.field, image, workshop.backbone, pipeline.effects, 5, restyling.stroke_size)
-    assert new.levels[-1].targets.feature_side == own.targets.feature_side // 2
-    for old, view, features in zip(own.views, new.levels[-1].views, before, strict=True):
+    own = {"stroke_size": 2.0, "kept_structure": 0.8}
+    restyling = Restyling(workshop, image, iterations=5, own=own)
+    settings = replace(pipeline.config, **own)
+    new = pipeline.new_task(restyling.field, image, workshop.backbone, pipeline.effects, 5, settings)
+    assert new.levels[-1].targets.feature_side == largest.targets.feature_side // 2
+    assert (new.levels[-1].targets.kept_structure, largest.targets.kept_structure) == (0.8, 0.5)
+    for old, view, features in zip(largest.views, new.levels[-1].views, before, strict=True):
         assert torch.equal(old.features, features)
         assert view.features.shape[-1] < features.shape[-1]
     assert list(restyling)[-1].done == 1.0
     folder = restyling.save()
     try:
-        assert load_run(folder / "config.yml").config.pipeline.stroke_size == 2.0
+        saved = load_run(folder / "config.yml").config.pipeline
+        assert (saved.stroke_size, saved.kept_structure) == (2.0, 0.8)
     finally:
         shutil.rmtree(folder)

@@ -343,6 +343,7 @@ def test_restyling_gives_a_style_that_blends_and_a_run_that_renders(
         panel.restyling, "tell", lambda progress: [tell(progress), seen.append(drawn(panel).sum().item())]
     )
     first = drawn(panel)
+    panel.restyling.stroke_size.value, panel.restyling.kept_structure.value = 1.3, 0.7
     panel.restyling.restyle_upload("other painting.png", png(3))
     said = wait_for(panel)
     assert said.startswith("**other painting** is ready. Saved as a run of its own: ")
@@ -361,6 +362,7 @@ def test_restyling_gives_a_style_that_blends_and_a_run_that_renders(
     assert str(saved) in said
     _, pipeline, step = load_run(saved / "config.yml")
     assert step == 2 and pipeline.config.style_image.read_bytes() == png(3)
+    assert (pipeline.config.stroke_size, pipeline.config.kept_structure) == (1.3, 0.7)
     camera = pipeline.datamanager.train_dataset.cameras[:1]
     with pipeline.model.display.rendering("baked"):
         assert torch.equal(pipeline.model.get_outputs_for_camera(camera)["rgb"], second)
