@@ -544,6 +544,9 @@ TABLE = [
     ),
     Advice("; give a number from 0 to 1.", style("--pipeline.model.strength 2"), style("--pipeline.model.strength 1")),
     Advice(
+        "--pipeline.model.num-steps is ", style("--pipeline.model.num-steps 1"), style("--pipeline.model.num-steps 2")
+    ),
+    Advice(
         "; give 1 or more, or None",
         style("--pipeline.model.num-eval-samples 0"),
         style("--pipeline.model.num-eval-samples None"),

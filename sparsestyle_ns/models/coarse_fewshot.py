@@ -44,8 +44,6 @@ class CoarseFewShotModelConfig(SceneModelConfig):
     """Samples a ray in training."""
     num_eval_samples: int = 6
     """Samples a ray in pictures of a trained field, where its weight is; while it learns, as many as in training."""
-    num_steps: int = 128
-    """Even steps along a ray on which the weight of a trained field is looked for, in a volume of its densities."""
     volume_resolution: int = 128
     """Cells along a side of this volume."""
     num_bins: int = 64

@@ -38,8 +38,6 @@ class HierStyleModelConfig(FineFieldConfig, SceneModelConfig):
     """Settings of both fields and of how they are rendered."""
 
     _target: Type = field(default_factory=lambda: HierStyleModel)
-    num_steps: int = 128
-    """Even steps along a ray, on which the frozen coarse field is looked at; those in empty cells are skipped."""
     num_samples: Optional[int] = 4
     """Samples a ray on which the stylised field learns, where the coarse field's weight is; None: every step that can
     show, as with a fine-tuned copy of the coarse field, whose weight moves."""

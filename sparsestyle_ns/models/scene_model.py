@@ -34,6 +34,9 @@ class SceneModelConfig(ModelConfig):
     precision: Precision = "auto"
     """Number format of matrix products: auto is bfloat16 where the device multiplies it, else float32; tf32 is for
     GPUs."""
+    num_steps: int = 128
+    """Even steps along a ray, 2 or more, on which a trained coarse field's weight is looked for, in a volume of its
+    densities; those in empty cells are skipped."""
     eval_num_rays_per_chunk: int = 8192
     """Rays rendered at once outside of training."""
 
@@ -80,6 +83,8 @@ class SceneModel(Model):
             raise InputError(
                 "--pipeline.model.enable-collider has no use here: the scene's space ends rays; leave it out."
             )
+        if self.config.num_steps < 2:  # an unbounded space's last step is endless, and says nothing of where to look
+            raise InputError(f"--pipeline.model.num-steps is {self.config.num_steps}; give 2 or more.")
         if self.config.eval_num_rays_per_chunk < 1:
             raise InputError(f"--eval-num-rays-per-chunk is {self.config.eval_num_rays_per_chunk}; give 1 or more.")
 

@@ -119,8 +119,8 @@ def _weigh(depth, count, weights):
 
 
 @inlined
-def _scale_to_one(values, count):
-    """Of what the values have to be multiplied by, so that their sum is 1; anything where it is 0."""
+def _over_sum(values, count):
+    """What values are multiplied by for a sum of 1; any number where all are 0."""
     total = 0.0
     for step in range(count):
         total += values[step]
@@ -202,19 +202,18 @@ def cut_rays(start, end, lines, look, least_light, kept, s, lengths, depth):
             continue
         values = lines.values[ray]
         line = values[0], values[1], values[2], values[3], values[4], values[5]
-        light = _ONE
         _look(lines, line, look, lines.edges, steps, True, taus, spans)
         _weigh(taus, steps, weights)
         for step in range(steps):  # a surface may lie at the end of a step that hardly shows it
             mass[step] = max(weights[max(step - 1, 0)], weights[step], weights[min(step + 1, steps - 1)])
-        near, evenly = _scale_to_one(mass, steps), _scale_to_one(spans, steps)
+        near, evenly = _over_sum(mass, steps), _over_sum(spans, steps)
         for step in range(steps):
             mass[step] = _mixed(near * mass[step], evenly * spans[step], look.fine_even_share) + look.tiny
         _accumulate(mass, steps, until)
         _quantiles(lines.edges, until, steps, fine, edges)
         _look(lines, line, look, edges, fine, False, taus, spans)
         _weigh(taus, fine, weights)
-        near, evenly = _scale_to_one(weights, fine), _scale_to_one(spans, fine)
+        near, evenly = _over_sum(weights, fine), _over_sum(spans, fine)
         for step in range(fine):
             mass[step] = _mixed(near * weights[step], evenly * spans[step], look.share) + look.tiny
         _accumulate(mass, fine, until)
@@ -229,7 +228,7 @@ def cut_rays(start, end, lines, look, least_light, kept, s, lengths, depth):
         _accumulate(mass, fine, until)
         step, part = _place(edges, fine, borders[0], look.tiny, 0)
         middle, before = 0, _mixed(until[step], until[step + 1], part)
-        total_depth = _ZERO
+        light, total_depth = _ONE, _ZERO
         for sample in range(count):
             first, share = step, part
             step, part = _place(edges, fine, borders[sample + 1], look.tiny, step)

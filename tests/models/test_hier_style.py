@@ -47,11 +47,10 @@ def make_untrained(effects=SPARE, seed=0, device="cpu", ndc=None, **settings):
         max_resolution=8,
         log2_table_size=8,
         layer_width=16,
-        num_steps=24,
         occupancy_resolution=4,
         precision="float32",
         bake_resolution=48,
-        **settings,
+        **{"num_steps": 24, **settings},
     )
     decisions = decided(*effects, background={"color": [1.0, 0.5, 0.0]})
     return config.setup(scene_box=BOX, num_train_data=1, effects=decisions, ndc=ndc, device=device).eval()
@@ -326,3 +325,8 @@ def test_pictures_have_samples_of_their_own_and_views_that_are_learned_from_othe
 def test_no_samples_at_all_are_refused(name):
     with pytest.raises(InputError, match=f"--pipeline.model.{name.replace('_', '-')} is 0; give 1 or more"):
         make_model(**{name: 0})
+
+
+def test_a_single_step_is_refused():
+    with pytest.raises(InputError, match=r"--pipeline\.model\.num-steps is 1; give 2 or more"):
+        make_model(num_steps=1)
