@@ -94,13 +94,8 @@ class RestylingControls:
             self.path = gui.add_text("Image", "", hint="path of a picture on the machine that the viewer runs on")
             self.iterations = gui.add_number("Iterations", iterations)
             self.stroke_size = gui.add_slider("Stroke size", *STROKE_SIZES, step=0.1, initial_value=stroke_size)
-            self.kept_structure = gui.add_slider(
-                "Kept structure",
-                *(0.0, 1.0),
-                step=0.05,
-                initial_value=kept_structure,
-                hint="how much of the photos' light and dark views keep at least (SSIM)",
-            )
+            hint = "how much of the photos' light and dark views keep at least (SSIM)"
+            self.kept_structure = gui.add_slider("Kept structure", 0.0, 1.0, 0.05, kept_structure, hint=hint)
             gui.add_button("Restyle").on_click(lambda _: self.restyle_path())
             upload = gui.add_upload_button("Upload and restyle", mime_type="image/*")
             upload.on_upload(lambda event: self.restyle_upload(event.target.value.name, event.target.value.content))
