@@ -105,7 +105,7 @@ def _cut_compiled(lines: Lines, few: FewSamples, occupancy: Optional[Occupancy])
     num_rays, count = len(lines.hit), few.count + lines.unbounded
     is_kept = torch.zeros(num_rays, count, dtype=torch.bool)
     results = [torch.zeros(num_rays, count) for _ in range(3)]
-    look = few_samples_kernels.Look(
+    settings = few_samples_kernels.Settings(
         few.volume.log_density.numpy(),
         np.ones((1, 1, 1), dtype=bool) if occupancy is None else occupancy.occupied.numpy(),
         FINE_STEPS,
@@ -116,7 +116,7 @@ def _cut_compiled(lines: Lines, few: FewSamples, occupancy: Optional[Occupancy])
         np.float32(LEAST_WEIGHT if few.even_share == 0.0 else -1.0),
         np.float32(TINY),
     )
-    arrays = lines, look, np.float32(LEAST_WEIGHT), is_kept.numpy(), *(each.numpy() for each in results)
+    arrays = lines, settings, np.float32(LEAST_WEIGHT), is_kept.numpy(), *(each.numpy() for each in results)
     parts = even_parts(num_rays, -(-num_rays // RAYS_PER_PART))
     run_on_threads(few_samples_kernels.cut_rays, [(*part, *arrays) for part in parts])
     return _Cut(is_kept, *results)

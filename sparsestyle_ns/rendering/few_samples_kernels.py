@@ -15,7 +15,7 @@ _DARK = np.float32(1e-7)  # of the light: what is behind doesn't say where to lo
 _EPSILON, _LEAST_SUM = np.float32(np.finfo(np.float32).eps), np.float32(1e-12)
 
 
-class Look(NamedTuple):
+class Settings(NamedTuple):
     """What rays are looked at with: see `few_samples`, whose names these are."""
 
     log_density: np.ndarray
@@ -85,7 +85,7 @@ def _stopped(depth):
 
 
 @inlined
-def _look(lines, line, look, edges, count, until_dark, depth, lengths):
+def _look(lines, line, settings, edges, count, until_dark, depth, lengths):
     """Optical depths by the volume, and lengths, of a ray's steps; 0 in empty cells.
 
     With `until_dark`, what no light reaches has no depth.
@@ -96,7 +96,7 @@ def _look(lines, line, look, edges, count, until_dark, depth, lengths):
     for step in range(count):
         x, y, z = point_at(lines, line, _HALF * (edges[step] + edges[step + 1]))
         depth[step] = _ZERO
-        if not _is_occupied(look.occupied, x, y, z):
+        if not _is_occupied(settings.occupied, x, y, z):
             lengths[step] = _ZERO
             continue
         if lines.bent:
@@ -105,7 +105,7 @@ def _look(lines, line, look, edges, count, until_dark, depth, lengths):
             lengths[step] = (edges[step + 1] - edges[step]) * extent
         if until_dark and behind > dark:
             continue
-        depth[step] = min(_volume_density(look.log_density, x, y, z) * lengths[step], _DEPTH_CAP)
+        depth[step] = min(_volume_density(settings.log_density, x, y, z) * lengths[step], _DEPTH_CAP)
         behind += depth[step]
 
 
@@ -179,7 +179,7 @@ def _gather(edges, until, moment, count, parts, tiny, borders, centers):
 
 
 @kernel
-def cut_rays(start, end, lines, look, least_light, kept, s, lengths, depth):
+def cut_rays(start, end, lines, settings, least_light, kept, s, lengths, depth):
     """Cuts the rays from `start` to `end` into stretches.
 
     Args:
@@ -187,7 +187,7 @@ def cut_rays(start, end, lines, look, least_light, kept, s, lengths, depth):
         kept: result, [rays, samples]: whether a stretch has a sample; an unbounded space's last step comes last.
         s, lengths, depth: results: see `few_samples.Stretches`; anything where there is no sample.
     """
-    steps, fine = len(lines.edges) - 1, look.fine_steps
+    steps, fine = len(lines.edges) - 1, settings.fine_steps
     count = kept.shape[1]
     if lines.unbounded:
         steps, count = steps - 1, count - 1
@@ -202,41 +202,41 @@ def cut_rays(start, end, lines, look, least_light, kept, s, lengths, depth):
             continue
         values = lines.values[ray]
         line = values[0], values[1], values[2], values[3], values[4], values[5]
-        _look(lines, line, look, lines.edges, steps, True, taus, spans)
+        _look(lines, line, settings, lines.edges, steps, True, taus, spans)
         _weigh(taus, steps, weights)
         for step in range(steps):  # a surface may lie at the end of a step that hardly shows it
             mass[step] = max(weights[max(step - 1, 0)], weights[step], weights[min(step + 1, steps - 1)])
         near, evenly = _over_sum(mass, steps), _over_sum(spans, steps)
         for step in range(steps):
-            mass[step] = _mixed(near * mass[step], evenly * spans[step], look.fine_even_share) + look.tiny
+            mass[step] = _mixed(near * mass[step], evenly * spans[step], settings.fine_even_share) + settings.tiny
         _accumulate(mass, steps, until)
         _quantiles(lines.edges, until, steps, fine, edges)
-        _look(lines, line, look, edges, fine, False, taus, spans)
+        _look(lines, line, settings, edges, fine, False, taus, spans)
         _weigh(taus, fine, weights)
         near, evenly = _over_sum(weights, fine), _over_sum(spans, fine)
         for step in range(fine):
-            mass[step] = _mixed(near * weights[step], evenly * spans[step], look.share) + look.tiny
+            mass[step] = _mixed(near * weights[step], evenly * spans[step], settings.share) + settings.tiny
         _accumulate(mass, fine, until)
         _quantiles(edges, until, fine, count, borders)
         for step in range(fine):
             mass[step] *= _HALF * (edges[step] + edges[step + 1])
         _accumulate(mass, fine, moment)
-        for _ in range(look.rounds):
-            _gather(edges, until, moment, fine, count, look.tiny, borders, centers)
+        for _ in range(settings.rounds):
+            _gather(edges, until, moment, fine, count, settings.tiny, borders, centers)
         for step in range(fine):
-            mass[step] = _mixed(near * weights[step], evenly * spans[step], look.share_within) + look.tiny
+            mass[step] = _mixed(near * weights[step], evenly * spans[step], settings.share_within) + settings.tiny
         _accumulate(mass, fine, until)
-        step, part = _place(edges, fine, borders[0], look.tiny, 0)
+        step, part = _place(edges, fine, borders[0], settings.tiny, 0)
         middle, before = 0, _mixed(until[step], until[step + 1], part)
         light, total_depth = _ONE, _ZERO
         for sample in range(count):
             first, share = step, part
-            step, part = _place(edges, fine, borders[sample + 1], look.tiny, step)
+            step, part = _place(edges, fine, borders[sample + 1], settings.tiny, step)
             after = _mixed(until[step], until[step + 1], part)
             half = 0.5 * (before + after)
             while middle < fine - 1 and until[middle + 1] <= half:
                 middle += 1
-            within = (half - until[middle]) / max(until[middle + 1] - until[middle], look.tiny)
+            within = (half - until[middle]) / max(until[middle + 1] - until[middle], settings.tiny)
             s[ray, sample] = _mixed(edges[middle], edges[middle + 1], min(max(np.float32(within), _ZERO), _ONE))
             tau, length = part * taus[step] - share * taus[first], part * spans[step] - share * spans[first]
             for between in range(first, step):
@@ -244,7 +244,7 @@ def cut_rays(start, end, lines, look, least_light, kept, s, lengths, depth):
                 length += spans[between]
             tau, length = max(tau, _ZERO), max(length, _ZERO)
             lengths[ray, sample], depth[ray, sample] = length, tau
-            kept[ray, sample] = length > _ZERO and light * _stopped(tau) > look.least_weight
+            kept[ray, sample] = length > _ZERO and light * _stopped(tau) > settings.least_weight
             light *= exponential(-min(tau, _DEPTH_CAP))
             total_depth += tau
             before = after

@@ -33,10 +33,12 @@ class Sweep(NamedTuple):
     """In tables and plots."""
     values: Tuple[float, ...]
     """From the strongest style to the most content."""
+    strengths: Tuple[float, ...] = ()
+    """With which pictures of the run with the last value are measured besides, each below 1."""
 
 
 SWEEPS = {
-    "ours": Sweep("pipeline.kept_structure", "structure", (0.0, 0.4, 0.6, 0.8)),
+    "ours": Sweep("pipeline.kept_structure", "structure", (0.0, 0.8), strengths=(0.7, 0.4)),
     "arf": Sweep("pipeline.loss_weights.content", "λ", (0.03, 0.3, 3.0)),
 }
 """Of each kind of stage 2."""
@@ -58,6 +60,8 @@ class FrontPoint:
     value: Optional[float]
     """Of the setting that keeps content; None for a kind that has none."""
     measured: RunFigures
+    strength: float = 1.0
+    """How much of the style its pictures show."""
 
     @property
     def kept(self) -> float:
@@ -103,8 +107,12 @@ class Fronts:
         measure = PaintingMeasure(self.painting)
         points = []
         for kind, runs in found.items():
-            for value, run in zip(SWEEPS[KINDS[kind][0]].values, runs, strict=True):
+            sweep = SWEEPS[KINDS[kind][0]]
+            for value, run in zip(sweep.values, runs, strict=True):
                 points.append(FrontPoint(kind, value, measure_run(run.folder, measure)))
+            for strength in sweep.strengths:
+                measured = measure_run(runs[-1].folder, measure, strength=strength)
+                points.append(FrontPoint(kind, sweep.values[-1], measured, strength))
         if can_transfer():
             ours = found[OURS][0].folder
             by_frame = measure_run(
@@ -122,8 +130,9 @@ def front_section(runs: PaperRuns, painting: Path, queue: RunQueue) -> Section:
     iterations = ", ".join(f"{kind}: {runs_of[0].iterations}" for kind, runs_of in found.items())
     text = (
         f"Each kind has the time that ours takes for its iterations, on views of the same sizes ({iterations}). "
-        "Ours keeps ever more structure, and the others have ever larger content weights. Measured on frames of the "
-        "path between the training cameras, each kind by its own unstylised geometry."
+        "Ours keeps ever more structure, and then shows ever less of its style (strength); the others have ever larger "
+        "content weights. Measured on frames of the path between the training cameras, each kind by its own unstylised "
+        "geometry."
     )
     section = Section(f"Style against content: {runs.study.name} in the style of {painting.stem}", text)
     section.tables = [points_table(points), ratios_table(points)]
@@ -137,9 +146,10 @@ def front_section(runs: PaperRuns, painting: Path, queue: RunQueue) -> Section:
 
 def point_name(point: FrontPoint) -> str:
     """A point in words."""
-    return (
-        point.kind if point.value is None else f"{point.kind}, {SWEEPS[KINDS[point.kind][0]].label} = {point.value:g}"
-    )
+    if point.value is None:
+        return point.kind
+    shown = "" if point.strength == 1.0 else f", strength = {point.strength:g}"
+    return f"{point.kind}, {SWEEPS[KINDS[point.kind][0]].label} = {point.value:g}{shown}"
 
 
 def points_table(points: Sequence[FrontPoint]) -> Table:

@@ -70,18 +70,20 @@ class PaintingMeasure:
 
 
 def measure_run(
-    folder: Path, painting: PaintingMeasure, way: str = "", stylise: Optional[Stylise] = None
+    folder: Path, painting: PaintingMeasure, way: str = "", stylise: Optional[Stylise] = None, strength: float = 1.0
 ) -> RunFigures:
     """What is measured of a stylised run on the measuring path; known figures are read again.
 
-    With the name of a way, and `stylise` for it, of frames stylised so in place of the run's own.
+    With the name of a way, and `stylise` for it, of frames stylised so in place of the run's own; with a strength below
+    1, of frames that show only so much of the style.
     """
+    way = way or ("" if strength == 1.0 else f"strength-{strength:g}")
     step = checkpoint_step(newest_checkpoint(folder / CHECKPOINT_FOLDER))
     target = _free_for(folder / (f"measured-{way}" if way else "measured"), step)
     known = read_figures(target, step)
     if known is not None:
         return known
-    settings, frames = _render(folder, step)
+    settings, frames = _render(folder, step, strength)
     if stylise is not None:
         frames = replace(frames, stylised=stylise(frames))
     figures = {**frames.figures(), **painting.figures(frames, settings)}
@@ -104,8 +106,11 @@ def _free_for(folder: Path, step: int) -> Path:
 
 
 @functools.lru_cache(maxsize=1)
-def _render(folder: Path, _step: int) -> Tuple[HierStylePipelineConfig, PathFrames]:
+def _render(folder: Path, _step: int, strength: float) -> Tuple[HierStylePipelineConfig, PathFrames]:
     config, pipeline, _ = load_run(folder / "config.yml")
+    display = pipeline.model.display
+    if strength != 1.0:
+        display.own = replace(display.own, mix=display.own.mix._replace(strength=strength))
     return config.pipeline, render_path(pipeline.model, measuring_path(pipeline.datamanager.train_dataset.cameras))
 
 

@@ -50,7 +50,7 @@ def make_untrained(effects=SPARE, seed=0, device="cpu", ndc=None, **settings):
         occupancy_resolution=4,
         precision="float32",
         bake_resolution=48,
-        **{"num_steps": 24, **settings},
+        **{"num_steps": 24, "bake_steps": None, **settings},
     )
     decisions = decided(*effects, background={"color": [1.0, 0.5, 0.0]})
     return config.setup(scene_box=BOX, num_train_data=1, effects=decisions, ndc=ndc, device=device).eval()
@@ -94,6 +94,12 @@ def test_a_baked_picture_is_nearly_the_exact_one_and_exact_is_the_default(model)
     expected = render(make_model())
     assert expected["rgb"].std() > 0.05
     assert_close(render(model), expected)
+
+
+def test_baked_pictures_have_steps_of_their_own():
+    own = make_model(render_mode="baked", num_steps=48, bake_steps=24)
+    assert_close(render(own), render(make_model(render_mode="baked", num_steps=24)), tolerance=0.0)
+    assert_close(render(own, "exact"), render(make_model(num_steps=48)), tolerance=0.0)
 
 
 def test_exact_pictures_bake_nothing(model):
@@ -327,6 +333,7 @@ def test_no_samples_at_all_are_refused(name):
         make_model(**{name: 0})
 
 
-def test_a_single_step_is_refused():
-    with pytest.raises(InputError, match=r"--pipeline\.model\.num-steps is 1; give 2 or more"):
-        make_model(num_steps=1)
+@pytest.mark.parametrize("name", ["num_steps", "bake_steps"])
+def test_a_single_step_is_refused(name):
+    with pytest.raises(InputError, match=rf"--pipeline\.model\.{name.replace('_', '-')} is 1; give 2 or more"):
+        make_model(**{name: 1})

@@ -32,7 +32,7 @@ from sparsestyle_ns.studies.paper_studies import (
     smoothing,
     study_sections,
 )
-from sparsestyle_ns.studies.run_figures import PaintingMeasure, measure_run
+from sparsestyle_ns.studies.run_figures import PaintingMeasure, measure_run, read_figures
 from sparsestyle_ns.studies.run_queue import Run, RunQueue
 from sparsestyle_ns.studies.study import Study
 from sparsestyle_ns.studies.study_options import StudyOptions
@@ -218,13 +218,20 @@ def test_compare_draws_style_against_content_in_equal_time(
     kinds = ("ours", "arf")
     monkeypatch.setattr(front, "PROBE_ITERATIONS", 4)
     for kind in kinds:
-        monkeypatch.setitem(front.SWEEPS, kind, front.SWEEPS[kind]._replace(values=(0.1, 1.0)))
+        strengths = front.SWEEPS[kind].strengths[:1]
+        monkeypatch.setitem(front.SWEEPS, kind, front.SWEEPS[kind]._replace(values=(0.1, 1.0), strengths=strengths))
     monkeypatch.setattr(front, "KINDS", {name: front.KINDS[name] for name in (front.OURS, front.ARF)})
     main([*arguments("compare", llff_scene, painting, tmp_path, 4), "--front"])
     assert set(train_here) == {"ours", *(f"ours-{kind}-painting-{weight}" for kind in kinds for weight in ("0.1", "1"))}
     page = (tmp_path / "compare.html").read_text()
     for kind in (*front.KINDS, front.FRAME_BY_FRAME):
         assert shown(kind) in page
+    weaker = f"{front.SWEEPS['ours'].strengths[0]:g}"
+    assert shown(f"{front.OURS}, structure = 1, strength = {weaker}") in page
+    whole, weak = (
+        read_figures(next(tmp_path.rglob(name)), 3).figures for name in ("measured", f"measured-strength-{weaker}")
+    )
+    assert weak[front.KEPT] > whole[front.KEPT]
     for distance in front.DISTANCES:
         assert shown(LABELS[distance][0]) in page
 
