@@ -3,10 +3,12 @@
 Numba's own thread pools can't be entered from two threads at once, as a viewer does: work is shared out here.
 """
 
+import contextlib
 import functools
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from typing import Callable, ParamSpec, Sequence, Tuple, TypeVar
+from pathlib import Path
+from typing import Callable, ParamSpec, Sequence, Set, Tuple, TypeVar
 
 import numba
 import torch
@@ -18,14 +20,33 @@ R = TypeVar("R")
 def kernel(function: Callable[..., None]) -> Callable[..., None]:
     """Compiles a function of arrays and numbers, on its first call, to run without the GIL; nothing checks bounds."""
     options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+    with contextlib.suppress(OSError):
+        _forget_stale(Path(function.__code__.co_filename), function.__name__)
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # neither the package's folder nor a cache folder can be written to
         return numba.njit(**options)(function)
 
 
+def _forget_stale(source: Path, name: str) -> None:
+    """Removes the index of what was compiled of a kernel before its file, or one that has parts of it, changed.
+
+    numba looks at the kernel's own file alone, and only after it has read an index, which a renamed class makes
+    unreadable.
+    """
+    changed = max(each.stat().st_mtime for each in {source, *_files_of_parts})
+    for index in (source.parent / "__pycache__").glob(f"{source.stem}.{name}-*.nbi"):
+        if index.stat().st_mtime < changed:
+            index.unlink(missing_ok=True)
+
+
+_files_of_parts: Set[Path] = set()
+"""Those that kernels may be compiled from, beside their own: a module's parts are there before its kernels."""
+
+
 def inlined(function: Callable[..., R]) -> Callable[..., R]:
     """Compiles a part of a kernel into whatever calls it: a call would hand over each array as a handful of numbers."""
+    _files_of_parts.add(Path(function.__code__.co_filename))
     return numba.njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)(function)
 
 
