@@ -70,6 +70,44 @@ def palette_transform(content_mean, content_covariance, style_mean, style_covari
     return matrix, style_mean - matrix @ content_mean
 
 
+def carried_in_order(points, target, rotation):
+    """Each point's place along each axis of a rotation, taken by what the target has there; as many as points."""
+    moved = np.zeros_like(points)
+    for axis in rotation.T:
+        places = sorted(range(len(points)), key=lambda index: points[index] @ axis)
+        for index, wanted in zip(places, sorted(point @ axis for point in target), strict=True):
+            moved[index] += wanted * axis
+    return moved
+
+
+def smooth_table(colors, offsets, side, smoothness, least):
+    """`palette.smooth_table` as a least-squares problem written out, a row for each term; by [r, g, b] and channel."""
+    rows, wanted, cells = [], [], side - 1
+    for color, offset in zip(colors, offsets, strict=True):
+        lower = np.minimum((color * cells).astype(int), cells - 1)
+        for corner in itertools.product((0, 1), repeat=3):
+            fraction = color * cells - lower
+            pull = np.sqrt(np.prod(np.where(corner, fraction, 1 - fraction)) / len(colors))
+            row = np.zeros((side,) * 3)
+            row[tuple(lower + corner)] = pull
+            rows.append(row.ravel())
+            wanted.append(pull * offset)
+    for axis in range(3):
+        for place in itertools.product(range(side), repeat=3):
+            if 0 < place[axis] < cells:
+                row = np.zeros((side,) * 3)
+                for step, factor in ((-1, 1), (0, -2), (1, 1)):
+                    near = list(place)
+                    near[axis] += step
+                    row[tuple(near)] = factor
+                rows.append(row.ravel() * np.sqrt(smoothness))
+                wanted.append(np.zeros(3))
+    rows += list(np.eye(side**3) * np.sqrt(least))
+    wanted += [np.zeros(3)] * side**3
+    found = np.linalg.lstsq(np.array(rows), np.array(wanted), rcond=None)[0]
+    return found.reshape(side, side, side, 3)
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # evaluation
 # ---------------------------------------------------------------------------------------------------------------------

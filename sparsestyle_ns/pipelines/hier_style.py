@@ -23,6 +23,7 @@ from sparsestyle_ns.pipelines.scene_pipeline import CheckedPipeline, CheckedPipe
 from sparsestyle_ns.pipelines.scene_views import ContentView, SceneViews
 from sparsestyle_ns.style.backbone import Backbone
 from sparsestyle_ns.style.painting import Painting
+from sparsestyle_ns.style.palette import PaletteTransfer
 from sparsestyle_ns.utils.errors import InputError
 from sparsestyle_ns.utils.progress import say
 
@@ -65,6 +66,9 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     kept_structure: Annotated[float, tyro.conf.arg(aliases=("--kept-structure",))] = 0.5
     """The SSIM of brightness to its content picture that a view keeps at least, from 0 to 1, however strong the
     painting's patterns are; more keeps more of the scene, and less of the painting."""
+    palette_transfer: PaletteTransfer = "transport"
+    """How photos get the painting's colours (`--pipeline.effects.palette`): transport gives them all of these, each as
+    often as the painting has it; moments gives them its mean colour and covariance, as ARF does."""
     content_decay: float = 0.01
     """α, the share of the content loss's weight that is left in the end."""
     content_share: float = 0.6
@@ -205,7 +209,9 @@ class HierStylePipeline(CheckedPipeline):
             self.scene_views = self.freeze_views()
         targets = [self.targets_of(painting, backbone, level.scale, settings) for level in schedule]
         scales = [self._share_of_photos(level.scale) for level in schedule]
-        views = self.scene_views.for_painting(dict(zip(scales, targets, strict=True)), effects)
+        by_scale = dict(zip(scales, targets, strict=True))
+        transfer = (settings or self.config).palette_transfer
+        views = self.scene_views.for_painting(by_scale, effects, transfer)
         return StyleTask(style, list(map(StyleLevel, schedule, targets, views)))
 
     def targets_of(

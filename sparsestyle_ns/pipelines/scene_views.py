@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Dict, List, Mapping, Optional, Sequence, Tuple
+from typing import Dict, List, Mapping, Optional, Sequence
 
 import torch
 from jaxtyping import Float
@@ -18,13 +18,10 @@ from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, TrainingPixels
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.render import accumulation_of, seen_behind
-from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
+from sparsestyle_ns.style.palette import Palette, PaletteTransfer, palette_of
 from sparsestyle_ns.utils.device_sizes import bytes_to_keep
 from sparsestyle_ns.utils.distributed import gather_rays, num_processes, shard_rays
 from sparsestyle_ns.utils.progress import track
-
-Palette = Tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]
-"""The matrix and the offset of `palette_transform`."""
 
 
 @dataclass
@@ -113,9 +110,16 @@ class SceneViews:
         return ContentView(frozen, outputs["rgb_coarse"], outputs["accumulation_coarse"].squeeze(-1))
 
     @torch.no_grad()
-    def for_painting(self, targets: Mapping[float, StyleTargets], effects: Decisions) -> List[List[ContentView]]:
-        """The views, by their size, with what they must stay like for a painting, given for each scale."""
-        palette = self._palette(next(iter(targets.values())).style_image) if effects.on("palette") else None
+    def for_painting(
+        self, targets: Mapping[float, StyleTargets], effects: Decisions, transfer: PaletteTransfer
+    ) -> List[List[ContentView]]:
+        """The views, by their size, with what they must stay like for a painting, given for each scale.
+
+        Where the palette is an effect, it is transferred once for all sizes, from the painting at the largest.
+        """
+        palette = None
+        if effects.on("palette"):
+            palette = self._palette(targets[max(targets)].style_picture, transfer)
         return [
             [self._for_painting(view, each, palette) for view in self.by_scale[scale]]
             for scale, each in targets.items()
@@ -125,7 +129,7 @@ class SceneViews:
         """A view in the painting's colours, with features; a background that is seen through the scene stays."""
         seen_through = self.model.background is not None
         if palette is not None:
-            picture = apply_palette(view.picture, *palette, clamp=True)
+            picture = palette.apply(view.picture)
             if seen_through:
                 picture = torch.lerp(view.picture, picture, view.accumulation[..., None].clamp(0.0, 1.0))
             view = replace(view, picture=picture, features=None)
@@ -135,14 +139,12 @@ class SceneViews:
         # A copy: while one painting is trained, another may have the features made anew.
         return replace(view, accumulation=view.accumulation if seen_through else None)
 
-    def _palette(self, style_image: Float[Tensor, "3 H W"]) -> Palette:
+    def _palette(self, style_picture: Float[Tensor, "3 h w"], transfer: PaletteTransfer) -> Palette:
         """The map of the photos' colours to the painting's."""
         photos = list(self.by_scale.values())[-1][: self.num_photos]
         colors = torch.cat([view.picture.reshape(-1, 3) for view in photos])
-        weight = torch.cat([view.accumulation.reshape(-1) for view in photos])
-        return palette_transform(
-            *color_moments(colors, weight), *color_moments(style_image.permute(1, 2, 0).reshape(-1, 3))
-        )
+        weights = torch.cat([view.accumulation.reshape(-1) for view in photos])
+        return palette_of(colors, weights, style_picture.flatten(1).T.clamp(0.0, 1.0), transfer)
 
     def render(self, view: ContentView, style: nn.Module, coarse_geometry: bool = False) -> Float[Tensor, "H W 3"]:
         """The stylised picture of a view, to whose rays each process contributes its share; differentiable."""

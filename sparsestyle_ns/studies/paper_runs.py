@@ -34,6 +34,7 @@ CONTENT_WEIGHTS = (2.0, 0.2, 0.02)
 FINE_TUNING: Settings = {
     "pipeline.model.stylised_field": "coarse",
     "optimizers.fields.optimizer.lr": 5e-4,
+    "pipeline.palette_transfer": "moments",
     **PAPER_LOSSES,
     "pipeline.loss_weights.content": 0.1,
     **CONSTANT,

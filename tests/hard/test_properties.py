@@ -49,7 +49,7 @@ from sparsestyle_ns.losses import content, nnfm, structure, style_index
 from sparsestyle_ns.losses import stylization as targets
 from sparsestyle_ns.rendering import baked, frozen_view, mixing, visible_samples
 from sparsestyle_ns.rendering import render as volume
-from sparsestyle_ns.style import backbones, color
+from sparsestyle_ns.style import backbones, color, palette
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.device_sizes import SIZES
 
@@ -736,6 +736,22 @@ def test_transferred_colours_have_the_styles_mean(data, count, style_count, dtyp
     torch.testing.assert_close(color.color_moments(transferred, weights)[0], style_mean, rtol=0, atol=1e-3)
     cut = color.apply_palette(colors, matrix, offset, clamp=True)
     assert (cut >= 0).all() and (cut <= 1).all()
+
+
+@covers(palette.palette_of, palette.transport, palette.smooth_table)
+@given(st.data(), st.integers(1, 60), st.integers(1, 60), FLOATS, st.sampled_from(["transport", "moments"]))
+def test_a_palette_gives_every_colour_another_that_can_be_shown(data, count, style_count, dtype, transfer):
+    colors = data.draw(tensors((count, 3), -12, 0, dtype=dtype))
+    style = data.draw(tensors((style_count, 3), -12, 0, dtype=dtype))
+    weights = data.draw(tensors((count,), -12, 0))
+    assume(weights.sum() > 0)
+    own = palette.palette_of(colors, weights, style, transfer)
+    mapped = own.apply(colors)
+    assert mapped.dtype == dtype and (mapped >= 0).all() and (mapped <= 1).all()
+    carried = palette.transport(colors, style)
+    assert carried.isfinite().all() and (carried.abs() <= 3.0).all()
+    table = palette.smooth_table(colors, carried - colors)
+    assert table.isfinite().all()
 
 
 @given(
