@@ -120,6 +120,7 @@ class Restyling:
             left = (time.monotonic() - began) / (step + 1) * (total - step - 1)
             done = (warm_up + step + 1) / (warm_up + total)
             yield Progress(f"Iteration {step + 1} of {total}", done, left, losses)
+        pipeline.finish(task)
         self.field.requires_grad_(False)
 
     def _step(self, task: StyleTask, step: int) -> Dict[str, float]:

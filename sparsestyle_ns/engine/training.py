@@ -140,5 +140,7 @@ class Training:
             callback.run_callback_at_location(self.num_steps, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
         step = self.num_steps
         loss, *_ = training_step(self.optimizers, lambda: self.pipeline.get_train_loss_dict(step)[1:], step)
+        for callback in self.callbacks:
+            callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
         self.num_steps += 1
         return loss

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from sparsestyle_ns.field_components.color_map import ColorMap
 from sparsestyle_ns.field_components.hash_grid import GridLocation, HashGrid
 from sparsestyle_ns.field_components.positional_encoding import FrequencyEncoding, NoEncoding, PointEncoding
 from sparsestyle_ns.field_components.tiny_cuda_grid import TinyCudaGrid, has_tiny_cuda_nn
@@ -18,12 +19,14 @@ from sparsestyle_ns.fields.residual import ResidualField
 class FineTunedField(nn.Module):
     """(σ, c) of a copy of the coarse field, which learns while the coarse field stays as it is.
 
-    Colour is that of a view straight ahead from everywhere: ARF, too, stylises without view dependence.
+    Colour is that of a view straight ahead from everywhere: ARF, too, stylises without view dependence. `recoloring`
+    is as in the residual field.
     """
 
     def __init__(self, field: CoarseField) -> None:
         super().__init__()
         self.field = field
+        self.recoloring = ColorMap()
 
     def locate(self, positions: Float[Tensor, "points 3"]) -> GridLocation:
         """Field coordinates in [−1, 1]³, as they are."""
@@ -35,7 +38,8 @@ class FineTunedField(nn.Module):
         """σ and c in [0, 1] at located points; what the frozen field has there isn't looked at."""
         density, own_feature = self.field.density_and_feature(location.positions)
         ahead = -torch.eye(3, device=location.positions.device)[2]
-        return density, self.field.color(own_feature, ahead.expand_as(location.positions)).float()
+        color = self.field.color(own_feature, ahead.expand_as(location.positions)).float()
+        return density, self.recoloring(color)
 
 
 StylisedField = Union[ResidualField, FineTunedField]

@@ -8,6 +8,7 @@ from nerfstudio.field_components.mlp import MLP
 from torch import Tensor, nn
 
 from sparsestyle_ns.field_components.blocked_mlp import blocked_mlp
+from sparsestyle_ns.field_components.color_map import ColorMap
 from sparsestyle_ns.field_components.hash_grid import GridLocation
 from sparsestyle_ns.field_components.positional_encoding import PointEncoding
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
@@ -41,7 +42,8 @@ def fine_density(residual: Float[Tensor, "*batch"], coarse: Float[Tensor, "*batc
 class ResidualField(nn.Module):
     """(σ', c_f) = F_f(ψ(x), e_c): an encoding ψ, `grid`, and an MLP, no view direction (Eq. 2).
 
-    At the start σ' is 0 everywhere, so that stylising begins from the coarse geometry, and c_f is grey.
+    At the start σ' is 0 everywhere, so that stylising begins from the coarse geometry, and c_f is grey. `recoloring`
+    maps the colours c_f of a finished field to the painting's, and does nothing while it learns.
 
     Args:
         density_scale: the MLP's density output is multiplied by this, so that one optimiser step moves σ' by an amount
@@ -74,6 +76,7 @@ class ResidualField(nn.Module):
         self.color_head = nn.Linear(layer_width, 3)
         self.density_head = nn.Linear(layer_width, 1) if with_density else None
         self.thinning = Thinning(0.0)
+        self.recoloring = ColorMap()
         if self.density_head is not None:
             nn.init.zeros_(self.density_head.weight)
             nn.init.zeros_(self.density_head.bias)
@@ -98,6 +101,6 @@ class ResidualField(nn.Module):
         logits = blocked_mlp((encoded, feature), hidden, heads, self.thinning).float()
         # In half precision a sigmoid reaches 1 at a logit of 6, and has no gradient from there on.
         if self.density_head is None:
-            return coarse_density, torch.sigmoid(logits)
+            return coarse_density, self.recoloring(torch.sigmoid(logits))
         density = fine_density(self.density_scale * logits[:, 3], coarse_density)
-        return density, torch.sigmoid(logits[:, :3])
+        return density, self.recoloring(torch.sigmoid(logits[:, :3]))

@@ -8,13 +8,14 @@ from typing import Annotated, Any, Callable, Dict, List, Literal, NamedTuple, Op
 import torch
 import tyro
 from jaxtyping import Float
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.models.base_model import ModelConfig
-from torch import Tensor, nn
+from torch import Tensor
 
 from sparsestyle_ns.core.schedules import Level, coarse_to_fine, content_weight
 from sparsestyle_ns.effects.decisions import Decisions
 from sparsestyle_ns.field_components.thinned_mlp import Thinning
+from sparsestyle_ns.fields.fine import StylisedField
 from sparsestyle_ns.fields.residual import ResidualField
 from sparsestyle_ns.losses.coarse import reconstruction_loss
 from sparsestyle_ns.losses.stylization import LOSSES, Losses, StyleTargets, default_weights
@@ -67,8 +68,9 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     """The SSIM of brightness to its content picture that a view keeps at least, from 0 to 1, however strong the
     painting's patterns are; more keeps more of the scene, and less of the painting."""
     palette_transfer: PaletteTransfer = "transport"
-    """How photos get the painting's colours (`--pipeline.effects.palette`): transport gives them all of these, each as
-    often as the painting has it; moments gives them its mean colour and covariance, as ARF does."""
+    """How photos and, in the end, the stylised field get the painting's colours (`--pipeline.effects.palette`):
+    transport gives them all of these, each as often as the painting has it; moments gives them its mean colour and
+    covariance, as ARF does."""
     content_decay: float = 0.01
     """α, the share of the content loss's weight that is left in the end."""
     content_share: float = 0.6
@@ -168,8 +170,10 @@ class StyleLevel(NamedTuple):
 class StyleTask(NamedTuple):
     """A field that is on its way to a painting, and the views that it is stylised on, one an iteration."""
 
-    style: nn.Module
+    style: StylisedField
     levels: List[StyleLevel]
+    transfer: Optional[PaletteTransfer] = None
+    """How the painting's palette is transferred, where it is."""
 
     def level(self, step: int) -> StyleLevel:
         """What counts in an iteration."""
@@ -193,7 +197,7 @@ class HierStylePipeline(CheckedPipeline):
 
     def new_task(
         self,
-        style: nn.Module,
+        style: StylisedField,
         painting: Painting,
         backbone: Backbone,
         effects: Decisions,
@@ -210,9 +214,20 @@ class HierStylePipeline(CheckedPipeline):
         targets = [self.targets_of(painting, backbone, level.scale, settings) for level in schedule]
         scales = [self._share_of_photos(level.scale) for level in schedule]
         by_scale = dict(zip(scales, targets, strict=True))
-        transfer = (settings or self.config).palette_transfer
-        views = self.scene_views.for_painting(by_scale, effects, transfer)
-        return StyleTask(style, list(map(StyleLevel, schedule, targets, views)))
+        transfer = (settings or self.config).palette_transfer if effects.on("palette") else None
+        views = self.scene_views.for_painting(by_scale, transfer)
+        return StyleTask(style, list(map(StyleLevel, schedule, targets, views)), transfer)
+
+    def finish(self, task: StyleTask) -> None:
+        """After a task's last iteration: where the palette is transferred, the field's colours are mapped to it.
+
+        Losses of features and of whole distributions leave a field with tints that the painting doesn't have.
+        """
+        task.style.recoloring.reset()
+        if task.transfer is not None:
+            _, targets, views = task.levels[-1]
+            palette = self.scene_views.last_palette(views, task.style, targets.style_picture, task.transfer)
+            task.style.recoloring.adopt(palette)
 
     def targets_of(
         self,
@@ -245,7 +260,9 @@ class HierStylePipeline(CheckedPipeline):
         self.task = self.new_task(self.model.residual, painting, backbone, self.effects, iterations)
         self.targets = self.task.levels[-1].targets
         say(self.scene_views.report())
-        return super().get_training_callbacks(training_callback_attributes)
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        last = TrainingCallback(after, lambda step: self.finish(self.task), iters=(iterations - 1,))
+        return [*super().get_training_callbacks(training_callback_attributes), last]
 
     def style_targets(self, style_image: Optional[Path] = None) -> Optional[StyleTargets]:
         """The painting to measure against, the run's own or another, where it is still there."""
@@ -283,6 +300,7 @@ class HierStylePipeline(CheckedPipeline):
         """One whole view of a task, and its losses with their weights in this iteration (Eq. 5 and 6)."""
         schedule, targets, views = task.level(step)
         view = views[step % len(views)]
+        task.style.recoloring.reset()  # of a finished field that learns on
         if isinstance(task.style, ResidualField):
             generator = torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + step)
             task.style.thinning = Thinning(self.config.thinning, generator)

@@ -11,14 +11,14 @@ from torch import Tensor, nn
 
 from sparsestyle_ns.core.camera_paths import at_poses, poses_between
 from sparsestyle_ns.data.photos import at_scale
-from sparsestyle_ns.effects.decisions import Decisions
+from sparsestyle_ns.field_components.color_map import ColorMap
 from sparsestyle_ns.losses.stylization import StyleTargets
 from sparsestyle_ns.losses.stylization_loss import Content
 from sparsestyle_ns.models.hier_style import HierStyleModel
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, TrainingPixels
 from sparsestyle_ns.rendering.frozen_view import FrozenView
 from sparsestyle_ns.rendering.render import accumulation_of, seen_behind
-from sparsestyle_ns.style.palette import Palette, PaletteTransfer, palette_of
+from sparsestyle_ns.style.palette import PaletteTransfer, palette_of
 from sparsestyle_ns.utils.device_sizes import bytes_to_keep
 from sparsestyle_ns.utils.distributed import gather_rays, num_processes, shard_rays
 from sparsestyle_ns.utils.progress import track
@@ -111,25 +111,23 @@ class SceneViews:
 
     @torch.no_grad()
     def for_painting(
-        self, targets: Mapping[float, StyleTargets], effects: Decisions, transfer: PaletteTransfer
+        self, targets: Mapping[float, StyleTargets], transfer: Optional[PaletteTransfer]
     ) -> List[List[ContentView]]:
         """The views, by their size, with what they must stay like for a painting, given for each scale.
 
-        Where the palette is an effect, it is transferred once for all sizes, from the painting at the largest.
+        Its palette is transferred, where it is, once for all sizes, from the painting at the largest.
         """
-        palette = None
-        if effects.on("palette"):
-            palette = self._palette(targets[max(targets)].style_picture, transfer)
+        palette = None if transfer is None else self._palette(targets[max(targets)].style_picture, transfer)
         return [
             [self._for_painting(view, each, palette) for view in self.by_scale[scale]]
             for scale, each in targets.items()
         ]
 
-    def _for_painting(self, view: ContentView, targets: StyleTargets, palette: Optional[Palette]) -> ContentView:
+    def _for_painting(self, view: ContentView, targets: StyleTargets, palette: Optional[ColorMap]) -> ContentView:
         """A view in the painting's colours, with features; a background that is seen through the scene stays."""
         seen_through = self.model.background is not None
         if palette is not None:
-            picture = palette.apply(view.picture)
+            picture = palette(view.picture)
             if seen_through:
                 picture = torch.lerp(view.picture, picture, view.accumulation[..., None].clamp(0.0, 1.0))
             view = replace(view, picture=picture, features=None)
@@ -139,12 +137,27 @@ class SceneViews:
         # A copy: while one painting is trained, another may have the features made anew.
         return replace(view, accumulation=view.accumulation if seen_through else None)
 
-    def _palette(self, style_picture: Float[Tensor, "3 h w"], transfer: PaletteTransfer) -> Palette:
+    def _palette(self, style_picture: Float[Tensor, "3 h w"], transfer: PaletteTransfer) -> ColorMap:
         """The map of the photos' colours to the painting's."""
         photos = list(self.by_scale.values())[-1][: self.num_photos]
         colors = torch.cat([view.picture.reshape(-1, 3) for view in photos])
         weights = torch.cat([view.accumulation.reshape(-1) for view in photos])
-        return palette_of(colors, weights, style_picture.flatten(1).T.clamp(0.0, 1.0), transfer)
+        return palette_of(colors, weights, _colors_of(style_picture), transfer)
+
+    @torch.no_grad()
+    def last_palette(
+        self,
+        views: Sequence[ContentView],
+        style: nn.Module,
+        style_picture: Float[Tensor, "3 h w"],
+        transfer: PaletteTransfer,
+    ) -> ColorMap:
+        """The map of a stylised field's colours, as these views show them, to the painting's."""
+        colors = torch.cat([self.render(view, style).reshape(-1, 3) for view in views]).clamp(0.0, 1.0)
+        whole = torch.ones_like(colors[:, 0])
+        seen_through = views[0].accumulation is not None
+        weights = torch.cat([view.accumulation.reshape(-1) for view in views]) if seen_through else whole
+        return palette_of(colors, weights, _colors_of(style_picture), transfer)
 
     def render(self, view: ContentView, style: nn.Module, coarse_geometry: bool = False) -> Float[Tensor, "H W 3"]:
         """The stylised picture of a view, to whose rays each process contributes its share; differentiable."""
@@ -160,6 +173,11 @@ class SceneViews:
         occupied = "" if occupancy is None else f", {occupancy.share:.0%} of space occupied"
         note = "" if whole == len(frozen) else "; the rest is computed again in each iteration"
         return f"{len(frozen)} views in {chunks} chunks{occupied}; {whole} views kept in {kept / 2**20:.0f} MiB{note}."
+
+
+def _colors_of(picture: Float[Tensor, "3 h w"]) -> Float[Tensor, "pixels 3"]:
+    """Those of a reduced picture's pixels, in [0, 1]."""
+    return picture.flatten(1).T.clamp(0.0, 1.0)
 
 
 def cameras_between(cameras: Cameras, count: int) -> List[Cameras]:

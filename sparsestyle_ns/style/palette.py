@@ -7,15 +7,15 @@ painting has two or ten. Transport carries the cloud into the painting's, whatev
 flat wall into patches. So only the smooth part of what it adds to the affine map is kept.
 """
 
-from typing import Literal, NamedTuple, Optional
+from typing import Literal
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 from sparsestyle_ns.core.sliced import quantiles
-from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
+from sparsestyle_ns.field_components.color_map import TABLE_SIDE, ColorMap
+from sparsestyle_ns.style.color import color_moments, palette_transform
 
 PaletteTransfer = Literal["transport", "moments"]
 
@@ -23,25 +23,9 @@ MOST_COLORS = 1 << 14
 """Colours that stand for all, drawn at random where there are more."""
 ROUNDS = 20
 """Rotations of the colour space along whose axes colours are carried."""
-TABLE_SIDE = 9
-"""Entries of the table along each axis of the colour cube."""
 SMOOTHNESS = 4e-5
 """Weight of the table's squared second differences, all added up, beside all colours' pulls, which add up to 1."""
 _LEAST = 1e-9  # for entries that neither colours nor neighbours say anything of
-
-
-class Palette(NamedTuple):
-    """A map of colours: an affine one, and what a table over the colour cube adds to that (see `apply`)."""
-
-    matrix: Float[Tensor, "3 3"]
-    offset: Float[Tensor, "3"]
-    table: Optional[Float[Tensor, "3 b g r"]] = None
-    """Offsets at even steps from 0 to 1, by the affine map's colours."""
-
-    def apply(self, colors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Each colour in [0, 1] as this palette has it, in [0, 1], of the colours' own dtype and on their device."""
-        mapped = apply_palette(colors, self.matrix, self.offset, clamp=True)
-        return mapped if self.table is None else (mapped + _looked_up(self.table, mapped)).clamp(0.0, 1.0)
 
 
 def palette_of(
@@ -49,20 +33,20 @@ def palette_of(
     weights: Float[Tensor, "colors"],
     style_colors: Float[Tensor, "style 3"],
     transfer: PaletteTransfer,
-) -> Palette:
+) -> ColorMap:
     """The map of a scene's colours, each with a weight ≥ 0, to a painting's; all in [0, 1].
 
     *moments* is `palette_transform`; *transport* adds the smooth part of `transport` to it.
     An `InputError` where no weight is positive.
     """
-    palette = Palette(*palette_transform(*color_moments(colors, weights), *color_moments(style_colors)))
+    moments = palette_transform(*color_moments(colors, weights), *color_moments(style_colors))
+    affine = [each.cpu() for each in moments]  # so that every device gets the same
     if transfer == "moments":
-        return palette
+        return ColorMap(*affine).to(colors.device)
     generator = torch.Generator().manual_seed(0)
-    # On the CPU, so that every device gets the same.
-    drawn = palette.apply(_drawn(colors.cpu(), weights.cpu(), generator))
+    drawn = ColorMap(*affine)(_drawn(colors.cpu(), weights.cpu(), generator))
     target = _drawn(style_colors.cpu(), torch.ones(len(style_colors)), generator)
-    return palette._replace(table=smooth_table(drawn, transport(drawn, target) - drawn).to(colors))
+    return ColorMap(*affine, smooth_table(drawn, transport(drawn, target) - drawn)).to(colors.device)
 
 
 def transport(points: Float[Tensor, "N 3"], target: Float[Tensor, "M 3"]) -> Float[Tensor, "N 3"]:
@@ -110,12 +94,6 @@ def _second_differences(side: int) -> Float[Tensor, "entries entries"]:
     bent = differences.T @ differences
     forms = ((bent, unit, unit), (unit, bent, unit), (unit, unit, bent))
     return sum(torch.kron(torch.kron(first, second), third) for first, second, third in forms)
-
-
-def _looked_up(table: Float[Tensor, "3 b g r"], colors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    places = (2.0 * colors - 1.0).reshape(1, 1, 1, -1, 3)
-    values = F.grid_sample(table.to(colors)[None], places, mode="bilinear", align_corners=True)
-    return values.reshape(3, -1).T.reshape(colors.shape)
 
 
 def _drawn(

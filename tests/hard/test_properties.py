@@ -746,7 +746,7 @@ def test_a_palette_gives_every_colour_another_that_can_be_shown(data, count, sty
     weights = data.draw(tensors((count,), -12, 0))
     assume(weights.sum() > 0)
     own = palette.palette_of(colors, weights, style, transfer)
-    mapped = own.apply(colors)
+    mapped = own(colors)
     assert mapped.dtype == dtype and (mapped >= 0).all() and (mapped <= 1).all()
     carried = palette.transport(colors, style)
     assert carried.isfinite().all() and (carried.abs() <= 3.0).all()

@@ -199,7 +199,7 @@ def test_a_coarse_field_that_is_fine_tuned_starts_as_it_is_and_alone_learns():
 def test_the_residual_field_sees_what_the_config_says_beside_the_coarse_feature(encoding, numbers):
     model = make_untrained(fine_encoding=encoding, frequency_levels=5)
     assert model.residual.mlp.layers[0].in_features == numbers + 4
-    assert any("table" in name for name in model.state_dict()) == (encoding == "hash")
+    assert any("grid.table" in name for name in model.state_dict()) == (encoding == "hash")
     assert render(model, "exact")["rgb"].isfinite().all()
 
 

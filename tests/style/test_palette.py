@@ -4,9 +4,10 @@ import reference
 import torch
 
 from sparsestyle_ns.core.sliced import random_directions, sliced_distance
+from sparsestyle_ns.field_components.color_map import ColorMap
 from sparsestyle_ns.style import palette
 from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
-from sparsestyle_ns.style.palette import Palette, palette_of, smooth_table, transport
+from sparsestyle_ns.style.palette import palette_of, smooth_table, transport
 from sparsestyle_ns.utils.errors import InputError
 
 WHITE, BLUE, YELLOW = [0.9, 0.9, 0.9], [0.1, 0.2, 0.7], [0.9, 0.8, 0.1]
@@ -22,7 +23,7 @@ def patches(*colors, count=300, spread=0.02):
 
 def mapped(colors, style, transfer="transport", weights=None):
     weights = torch.ones(len(colors)) if weights is None else weights
-    return palette_of(colors, weights, style, transfer).apply(colors)
+    return palette_of(colors, weights, style, transfer)(colors)
 
 
 def distance(first, second):
@@ -60,9 +61,9 @@ def test_the_table_is_read_where_its_colours_are():
     """Offsets that are a straight function of the colour are met nearly everywhere, between the colours as well."""
     colors = torch.rand(5000, 3, generator=torch.Generator().manual_seed(0))
     slope = torch.tensor([[0.1, 0.0, -0.1], [0.0, 0.05, 0.1], [0.02, -0.1, 0.0]])
-    own = Palette(torch.eye(3), torch.zeros(3), smooth_table(colors, colors @ slope))
+    own = ColorMap(torch.eye(3), torch.zeros(3), smooth_table(colors, colors @ slope))
     others = 0.2 + 0.6 * torch.rand(4, 25, 3, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(own.apply(others), others + others @ slope, atol=0.01, rtol=0)
+    torch.testing.assert_close(own(others), others + others @ slope, atol=0.01, rtol=0)
 
 
 def test_a_scene_of_three_colours_takes_the_two_of_a_painting():
@@ -80,7 +81,7 @@ def test_a_scene_of_three_colours_takes_the_two_of_a_painting():
 def test_the_noise_of_a_flat_wall_stays_noise():
     wall, things = patches(GREY, count=900, spread=1 / 255), patches(GREEN, BROWN, WHITE)
     scene, style = torch.cat([wall, things]), patches(BLUE, YELLOW, WHITE)
-    affine = palette_of(scene, torch.ones(len(scene)), style, "moments").apply(scene)
+    affine = palette_of(scene, torch.ones(len(scene)), style, "moments")(scene)
     assert transport(affine, style)[: len(wall)].std(dim=0).max() > 0.3
     assert mapped(scene, style)[: len(wall)].std(dim=0).max() < 0.1
 
@@ -95,7 +96,7 @@ def test_what_has_no_weight_doesnt_count():
     scene, sky, painting = patches(GREEN, BROWN), patches(WHITE), patches(BLUE, YELLOW)
     weights = torch.cat([torch.ones(len(scene)), torch.zeros(len(sky))])
     both = palette_of(torch.cat([scene, sky]), weights, painting, "transport")
-    torch.testing.assert_close(both.apply(scene), mapped(scene, painting), atol=0.05, rtol=0)
+    torch.testing.assert_close(both(scene), mapped(scene, painting), atol=0.05, rtol=0)
 
 
 def test_moments_are_the_affine_map_cut_to_what_can_be_shown():
@@ -108,7 +109,7 @@ def test_a_palette_keeps_shape_and_dtype():
     own = palette_of(patches(GREEN, BROWN), torch.ones(600), patches(BLUE), "transport")
     for shape in ((3,), (0, 3), (2, 5, 3)):
         for dtype in (torch.float32, torch.float64):
-            result = own.apply(torch.rand(shape, dtype=dtype))
+            result = own(torch.rand(shape, dtype=dtype))
             assert result.shape == shape and result.dtype == dtype
             assert ((result >= 0) & (result <= 1)).all()
 
