@@ -28,7 +28,7 @@ from sparsestyle_ns.effects.registry import EFFECTS, decide
 from sparsestyle_ns.engine.training import Training
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManager, gather_pixels
-from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
+from sparsestyle_ns.style.palette import palette_of
 from sparsestyle_ns.utils.errors import InputError, exit_on_input_error
 
 PARSERS: Dict[str, Callable[[], DataParserConfig]] = {
@@ -112,12 +112,12 @@ def lens_distortion(report: Report) -> Dict[str, Measure]:
 def palette(report: Report) -> Dict[str, Measure]:
     """Reading the training photos, and then giving them another palette or not."""
     manager = photos("llff", (), {}, report)
-    style = color_moments(torch.rand(10_000, 3, generator=torch.Generator().manual_seed(0)))
+    style = torch.rand(10_000, 3, generator=torch.Generator().manual_seed(0)).to(report.device)
 
     def read(transfer: bool) -> None:
         colors = gather_pixels(manager.train_dataset, report.device).colors
         if transfer:
-            apply_palette(colors, *palette_transform(*color_moments(colors), *style), clamp=True)
+            palette_of(colors, torch.ones_like(colors[:, 0]), style, "transport")(colors)
 
     return {"with": timed(lambda: read(True), report.device), "without": timed(lambda: read(False), report.device)}
 

@@ -1,4 +1,4 @@
-"""The painting's palette, given to the photos before stylising (ARF's transfer of mean colour and covariance)."""
+"""The painting's palette, given to the photos before stylising and to the finished field: whether there is a need."""
 
 import numpy as np
 import torch
