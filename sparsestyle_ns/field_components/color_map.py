@@ -11,6 +11,13 @@ TABLE_SIDE = 9
 """Entries of the table along each axis of the colour cube."""
 
 
+def affine(
+    colors: Float[Tensor, "*batch 3"], matrix: Float[Tensor, "3 3"], offset: Float[Tensor, "3"]
+) -> Float[Tensor, "*batch 3"]:
+    """A c + b for every colour, in the colours' own dtype and on their device."""
+    return colors @ matrix.to(colors).T + offset.to(colors)
+
+
 class ColorMap(nn.Module):
     """c ↦ A c + b, cut to [0, 1], and what a table over the colour cube adds to that, cut again.
 
@@ -58,7 +65,7 @@ class ColorMap(nn.Module):
         """Each colour in [0, 1] as the map has it, in [0, 1], of the colours' own dtype; differentiable."""
         if self.is_neutral:
             return colors
-        mapped = (colors @ self.matrix.to(colors).T + self.offset.to(colors)).clamp(0.0, 1.0)
+        mapped = affine(colors, self.matrix, self.offset).clamp(0.0, 1.0)
         places = (2.0 * mapped - 1.0).reshape(1, 1, 1, -1, 3)
         values = F.grid_sample(self.table.to(colors)[None], places, mode="bilinear", align_corners=True)
         return (mapped + values.reshape(3, -1).T.reshape(colors.shape)).clamp(0.0, 1.0)

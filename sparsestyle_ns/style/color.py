@@ -73,11 +73,3 @@ def palette_transform(
     whitening = (axes * gains) @ axes.T
     matrix = _square_root(style_covariance.double()) @ whitening
     return matrix, style_mean.double() - matrix @ content_mean.double()
-
-
-def apply_palette(
-    colors: Float[Tensor, "*batch 3"], matrix: Float[Tensor, "3 3"], offset: Float[Tensor, "3"], clamp: bool = False
-) -> Float[Tensor, "*batch 3"]:
-    """A c + b for every colour, in the colours' own dtype and on their device; `clamp` cuts it to [0, 1]."""
-    transferred = colors @ matrix.to(colors).T + offset.to(colors)
-    return transferred.clamp(0, 1) if clamp else transferred

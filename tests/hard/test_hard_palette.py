@@ -2,7 +2,8 @@ import pytest
 import torch
 from hard.table import hard_case
 
-from sparsestyle_ns.style.color import SMALLEST_SPREAD, apply_palette, color_moments, palette_transform
+from sparsestyle_ns.field_components.color_map import affine
+from sparsestyle_ns.style.color import SMALLEST_SPREAD, color_moments, palette_transform
 from sparsestyle_ns.utils.errors import InputError
 
 
@@ -12,7 +13,7 @@ def colors_of(seed, count=500):
 
 
 def transferred(content, style, weights=None):
-    return apply_palette(content, *palette_transform(*color_moments(content, weights), *color_moments(style)))
+    return affine(content, *palette_transform(*color_moments(content, weights), *color_moments(style)))
 
 
 @hard_case(

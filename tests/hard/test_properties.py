@@ -36,6 +36,7 @@ from sparsestyle_ns.data.scene_info import NDC
 from sparsestyle_ns.effects.layouts import build_space
 from sparsestyle_ns.field_components import (
     blocked_mlp,
+    color_map,
     hash_grid,
     hash_grid_kernels,
     positional_encoding,
@@ -717,7 +718,7 @@ def test_near_density_is_at_most_the_mean_density(data, num_rays, samples, reach
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-@covers(color.color_moments, color.palette_transform, color.apply_palette, color.gaussian_distance)
+@covers(color.color_moments, color.palette_transform, color_map.affine, color.gaussian_distance)
 @given(st.data(), st.integers(1, 60), st.integers(1, 60), FLOATS)
 def test_transferred_colours_have_the_styles_mean(data, count, style_count, dtype):
     colors = data.draw(tensors((count, 3), -12, 0, dtype=dtype))
@@ -727,14 +728,14 @@ def test_transferred_colours_have_the_styles_mean(data, count, style_count, dtyp
     mean, covariance = color.color_moments(colors, weights)
     assert torch.linalg.eigvalsh(covariance).min() >= -1e-15
     matrix, offset = color.palette_transform(mean, covariance, *color.color_moments(style))
-    transferred = color.apply_palette(colors, matrix, offset)
+    transferred = color_map.affine(colors, matrix, offset)
     style_mean, style_covariance = color.color_moments(style)
     distance = color.gaussian_distance(mean, covariance, style_mean, style_covariance)
     back = color.gaussian_distance(style_mean, style_covariance, mean, covariance)
     assert (mean - style_mean).norm() - 1e-6 <= distance <= 3.0
     torch.testing.assert_close(distance, back, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(color.color_moments(transferred, weights)[0], style_mean, rtol=0, atol=1e-3)
-    cut = color.apply_palette(colors, matrix, offset, clamp=True)
+    cut = color_map.ColorMap(matrix, offset)(colors)
     assert (cut >= 0).all() and (cut <= 1).all()
 
 

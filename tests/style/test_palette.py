@@ -4,9 +4,9 @@ import reference
 import torch
 
 from sparsestyle_ns.core.sliced import random_directions, sliced_distance
-from sparsestyle_ns.field_components.color_map import ColorMap
+from sparsestyle_ns.field_components.color_map import ColorMap, affine
 from sparsestyle_ns.style import palette
-from sparsestyle_ns.style.color import apply_palette, color_moments, palette_transform
+from sparsestyle_ns.style.color import color_moments, palette_transform
 from sparsestyle_ns.style.palette import palette_of, smooth_table, transport
 from sparsestyle_ns.utils.errors import InputError
 
@@ -101,7 +101,7 @@ def test_what_has_no_weight_doesnt_count():
 
 def test_moments_are_the_affine_map_cut_to_what_can_be_shown():
     scene, painting = patches(GREEN, BROWN), patches(BLUE, YELLOW)
-    expected = apply_palette(scene, *palette_transform(*color_moments(scene), *color_moments(painting)), clamp=True)
+    expected = affine(scene, *palette_transform(*color_moments(scene), *color_moments(painting))).clamp(0, 1)
     torch.testing.assert_close(mapped(scene, painting, "moments"), expected)
 
 
