@@ -120,6 +120,11 @@ class HierStyleModel(SceneModel):
         return self._marching(self.config.num_eval_samples)
 
     @property
+    def baked_marching(self) -> Marching:
+        """Where they lie in baked pictures."""
+        return replace(self.marching, num_steps=self.config.bake_steps or self.config.num_steps)
+
+    @property
     def learning(self) -> Marching:
         """Where they lie in the views that are stylised."""
         return self._marching(self.config.num_samples)
@@ -199,10 +204,10 @@ class HierStyleModel(SceneModel):
     def get_outputs(self, ray_bundle: RayBundle) -> Dict[str, Tensor]:
         """`rgb` (stylised), `accumulation`, `depth` in world units, and the same of the coarse field as `…_coarse`."""
         segments, unbounded, background = self.shown(ray_bundle)
-        look, marching = self.display.look, replace(self.marching, unbounded=unbounded)
-        styles = look.styles or (self.residual,)
-        if look.mode == "baked" and not self.training:
-            marching = replace(marching, num_steps=self.config.bake_steps or marching.num_steps)
+        look = self.display.look
+        styles, is_baked = look.styles or (self.residual,), look.mode == "baked" and not self.training
+        marching = replace(self.baked_marching if is_baked else self.marching, unbounded=unbounded)
+        if is_baked:
             fine, coarse = self.baked.render(styles, segments, marching, background, look.mix)
         else:
             most = sizes_for(self.device).marched_rays

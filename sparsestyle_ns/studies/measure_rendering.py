@@ -300,7 +300,7 @@ def _measure_baking(bench: Workbench, curve: Curve, budget: Budget) -> None:
             if volume is None:
                 return model.get_outputs(rays)["rgb" if bench.is_stylised else "rgb_coarse"]
             segments = model.space.segments(rays.origins, rays.directions)
-            fine, coarse = render_baked([volume], segments, model.marching, model.background)
+            fine, coarse = render_baked([volume], segments, model.baked_marching, model.background)
             return fine.rgb if bench.is_stylised else coarse.rgb
 
         at = frame % len(flight)

@@ -98,7 +98,7 @@ class Baker(threading.Thread):
             return None
         with self.lock:
             model, segments = self.model, self.model.space.segments(origins, directions)
-            model.baked.render((style,), segments, model.marching, model.background)
+            model.baked.render((style,), segments, model.baked_marching, model.background)
             volume = self.model.baked.kept(style)
         time.sleep(0.005)  # whoever waits for the lock gets it
         return volume
