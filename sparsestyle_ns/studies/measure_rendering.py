@@ -300,7 +300,8 @@ def _measure_baking(bench: Workbench, curve: Curve, budget: Budget) -> None:
             if volume is None:
                 return model.get_outputs(rays)["rgb" if bench.is_stylised else "rgb_coarse"]
             segments = model.space.segments(rays.origins, rays.directions)
-            fine, coarse = render_baked([volume], segments, model.baked_marching, model.background)
+            marching = model.baked_marching if bench.is_stylised else model.marching
+            fine, coarse = render_baked([volume], segments, marching, model.background)
             return fine.rgb if bench.is_stylised else coarse.rgb
 
         at = frame % len(flight)
