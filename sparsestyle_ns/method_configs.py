@@ -24,11 +24,20 @@ def adam(lr: float, scheduler: Optional[ShareSchedulerConfig] = None) -> Dict[st
     return {"optimizer": FusedAdamConfig(lr=lr), "scheduler": scheduler}
 
 
+COARSE_ITERATIONS = 2500
+
+
 def coarse_optimizers() -> Dict[str, Any]:
-    """Muon for the hidden layers' matrices, which is several times as fast as Adam alone; learning rates fall."""
-    muon = {"optimizer": MuonConfig(lr=0.02), "scheduler": ShareSchedulerConfig(final=0.02)}
-    cameras = adam(5e-4, ShareSchedulerConfig(final=0.01))
-    return {"fields": adam(1e-3, ShareSchedulerConfig(final=0.1)), "hidden_layers": muon, "cameras": cameras}
+    """Muon for the hidden layers' matrices, which is several times as fast as Adam alone; learning rates fall.
+
+    In a longer run they stay at their ends: many iterations at a high rate fit the photos, and not the scene.
+    """
+
+    def falling(final: float) -> ShareSchedulerConfig:
+        return ShareSchedulerConfig(final=final, longest_fall=COARSE_ITERATIONS)
+
+    muon = {"optimizer": MuonConfig(lr=0.02), "scheduler": falling(0.02)}
+    return {"fields": adam(1e-3, falling(0.1)), "hidden_layers": muon, "cameras": adam(5e-4, falling(0.01))}
 
 
 def method(
@@ -65,7 +74,7 @@ coarse_fewshot = method(
     "Coarse radiance field from three to eight photos (stage 1): about five minutes on two CPU cores at 504 pixels.",
     _target=CoarseFewShotTrainer,
     method_name="coarse-fewshot",
-    max_num_iterations=2500,
+    max_num_iterations=COARSE_ITERATIONS,
     steps_per_save=500,
     steps_per_log=50,
     pipeline=CoarseFewShotPipelineConfig(

@@ -1,4 +1,5 @@
-"""Learning rates by shares of a run's iterations: a shorter, a longer and a resumed run fall the same way."""
+"""Learning rates by shares of a run's iterations: a shorter, a longer and a resumed run fall the same way, each to its
+end, or as fast as runs of some length do."""
 
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Dict, Mapping, Optional, Tuple, Type
@@ -25,6 +26,8 @@ class ShareSchedulerConfig(SchedulerConfig):
     """What each milestone leaves of it."""
     final: float = 1.0
     """What the exponential fall, from the first iteration to the last, leaves of it; 1 is none."""
+    longest_fall: Optional[int] = None
+    """Iterations in which the exponential fall is over, however many the run has; what they leave is the rest's."""
     iterations: Annotated[Optional[int], tyro.conf.Suppress] = None
     """The run's; filled in when it begins."""
 
@@ -38,9 +41,15 @@ class ShareSchedulerConfig(SchedulerConfig):
                 f"A learning rate's warm-up, gamma, final and milestones are {numbers}; give shares from 0 to 1 with "
                 "--optimizers.GROUP.scheduler."
             )
+        if self.longest_fall is not None and self.longest_fall < 1:
+            raise InputError(
+                f"A learning rate's longest fall is {self.longest_fall}; give 1 iteration or more with "
+                "--optimizers.GROUP.scheduler.longest-fall."
+            )
+        fall = min(total, self.longest_fall or total)
         risen = min(1.0, (step + 1) / max(1, round(self.warm_up * total)))
         falls = sum(step >= round(milestone * total) for milestone in self.milestones)
-        return risen * self.gamma**falls * self.final ** min(1.0, step / total)
+        return risen * self.gamma**falls * self.final ** min(1.0, step / fall)
 
 
 class ShareScheduler(Scheduler):

@@ -35,6 +35,18 @@ def test_a_rate_falls_exponentially_to_its_end_and_stays_there():
     assert ratios == pytest.approx([0.01 ** (1 / 20)] * 20)
 
 
+def test_a_long_run_s_rate_falls_as_fast_as_a_shorter_one_s_and_stays_at_its_end():
+    short, long = (rates_of(ShareSchedulerConfig(final=0.01, longest_fall=20, iterations=n), n) for n in (20, 60))
+    assert long[:20] == pytest.approx(short) and long[20:] == pytest.approx([0.02] * 40)
+    shorter = rates_of(ShareSchedulerConfig(final=0.01, longest_fall=20, iterations=10), 12)
+    assert shorter[10:] == pytest.approx([0.02] * 2)
+
+
+def test_a_fall_of_no_iterations_is_refused():
+    with pytest.raises(InputError, match="longest fall is 0; give 1 iteration or more"):
+        ShareSchedulerConfig(longest_fall=0, iterations=10).factor(0)
+
+
 @pytest.mark.parametrize("total", [40, 400, 4000])
 def test_runs_of_any_length_have_one_schedule(total):
     schedule = ShareSchedulerConfig(warm_up=0.1, milestones=(0.5,), gamma=0.25, final=0.1)
