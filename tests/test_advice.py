@@ -508,6 +508,11 @@ TABLE = [
         coarse("--optimizers.fields.scheduler.final 2"),
         coarse("--optimizers.fields.scheduler.final 0.5"),
     ),
+    Advice(
+        "give 1 iteration or more with --optimizers.GROUP.scheduler.longest-fall",
+        coarse("--optimizers.fields.scheduler.longest-fall 0"),
+        coarse("--optimizers.fields.scheduler.longest-fall 5"),
+    ),
     Advice("try a lower learning rate, --optimizers.", skip_all, coarse("--optimizers.fields.optimizer.lr 1e-4")),
     Advice("go on from it with --load-dir", full_disk, lambda place: goes_on("--max-num-iterations 4", place)),
     Advice(
@@ -550,6 +555,11 @@ TABLE = [
         "; give 1 or more, or None",
         style("--pipeline.model.num-eval-samples 0"),
         style("--pipeline.model.num-eval-samples None"),
+    ),
+    Advice(
+        "--pipeline.model.bake-steps is ",
+        style("--pipeline.model.bake-steps 1"),
+        style("--pipeline.model.bake-steps 2"),
     ),
     Advice(
         "--pipeline.model.fine-encoding is tiny-cuda-nn",
