@@ -146,6 +146,7 @@ def test_a_stylised_checkpoint_holds_the_whole_scene_and_nothing_else(runs: Simp
         HASH_TABLE,
         *(f"_model.residual.mlp.layers.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")),
         *(f"_model.residual.{head}_head.{part}" for head in ("color", "density") for part in ("weight", "bias")),
+        *(f"_model.residual.recoloring.{part}" for part in ("matrix", "offset", "table")),
     }
     assert_same_state({key: coarse[key] for key in fields}, {key: style[key] for key in fields})
     backbone = load(runs.style)["backbone"]
