@@ -6,7 +6,6 @@ differentiating a stylised view, lens distortion in making all rays, palette tra
 is done once.
 """
 
-import copy
 import dataclasses
 import subprocess
 import sys
@@ -69,7 +68,7 @@ def make_scene(layout: str, flags: Tuple[str, ...], quick: bool) -> Path:
 
 def config_of(method: str, layout: str, folder: Path, settings: Dict[str, str]) -> Any:
     """A method's config for a scene, with some effects set."""
-    config = copy.deepcopy(method_config(method))
+    config = method_config(method)
     config.pipeline.datamanager.data, config.pipeline.datamanager.dataparser = folder, PARSERS[layout]()
     config.pipeline.effects = EffectSettings(**settings)
     if method == COARSE_METHOD:
@@ -131,7 +130,9 @@ def residual_density(report: Report) -> Dict[str, Measure]:
 
     def contender(on: bool) -> Measure:
         effects = manager.effects.replaced(dataclasses.replace(decision, on=on))
-        model = method_config("hier-style-draft").pipeline.model.setup(
+        settings = method_config("hier-style-draft").pipeline
+        settings.settle_resolution(manager.photo_side)
+        model = settings.model.setup(
             scene_box=dataset.scene_box, num_train_data=len(dataset), effects=effects, ndc=manager.scene.ndc
         )
         frozen = model.to(report.device).freeze(origins, directions)

@@ -127,7 +127,6 @@ hier_style_draft = variant(
         "pipeline.view_side": 252,
         "pipeline.view_scales": (0.5, 1.0),
         "pipeline.scale_shares": (0.85, 0.15),
-        "pipeline.model.max_resolution": 256,
     },
 )
 
@@ -167,6 +166,7 @@ hier_style_paper = variant(
         "pipeline.object_style": 1.0,
         "pipeline.loss_weights": {**dict.fromkeys(LOSSES, 0.0), "content": 10.0, "style": 1.0},
         "pipeline.model.min_resolution": 128,
+        "pipeline.model.max_resolution": 512,
         "pipeline.model.depth_cells": 1.0,
         "pipeline.warm_start_steps": 0,
         "pipeline.thinning": 0.0,
@@ -176,7 +176,7 @@ hier_style_paper = variant(
 
 
 def method_config(name: str) -> SparseStyleTrainerConfig:
-    """The config of one of this package's methods, by its name on the command line."""
+    """A copy of the config of one of this package's methods, by its name on the command line."""
     methods = (coarse_fewshot, coarse_fewshot_draft, coarse_fewshot_paper)
     methods += (hier_style, hier_style_draft, hier_style_paper)
-    return next(method.config for method in methods if method.config.method_name == name)
+    return copy.deepcopy(next(method.config for method in methods if method.config.method_name == name))

@@ -22,7 +22,9 @@ from conftest import TINY, TINY_STYLE, ns_train, only_run, run_entrypoint
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from scipy.spatial.transform import Rotation
 
+from sparsestyle_ns import method_configs
 from sparsestyle_ns.effects.registry import EFFECTS
+from sparsestyle_ns.engine.loading import load_run
 from sparsestyle_ns.engine.trainer import SparseStyleTrainer
 from sparsestyle_ns.method_configs import method_config
 from sparsestyle_ns.pipelines.datamanager import FewShotDataManagerConfig
@@ -152,6 +154,13 @@ def test_a_stylised_checkpoint_holds_the_whole_scene_and_nothing_else(runs: Simp
     backbone = load(runs.style)["backbone"]
     assert backbone["name"] in ("vgg16", "vgg16-shift-tolerant")
     assert len(backbone["sha256"]) == 64
+
+
+def test_a_run_says_how_fine_its_hash_grid_is_so_that_it_stays_so_with_photos_of_another_size(runs) -> None:
+    config = yaml.load((runs.style / "config.yml").read_text(), Loader=yaml.Loader)
+    cells = config.pipeline.model.max_resolution
+    photo = load_run(runs.style / "config.yml").pipeline.datamanager.photo_side
+    assert load(runs.style)["max_resolution"] == cells and photo <= cells < photo + 16
 
 
 def test_a_stylised_run_renders_without_painting_weights_and_coarse_run(
@@ -305,7 +314,7 @@ def test_a_coarse_run_that_isnt_finished_is_said_to_be(runs: SimpleNamespace, tm
 @pytest.fixture
 def short_coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Makes coarse-fewshot a method of two iterations of a narrow field."""
-    coarse = method_config("coarse-fewshot")
+    coarse = method_configs.coarse_fewshot.config
     monkeypatch.setattr(coarse, "max_num_iterations", 2)
     monkeypatch.setattr(coarse.pipeline.model.coarse_field, "layer_width", 32)
 

@@ -49,12 +49,45 @@ def test_stage_2_goes_from_126_pixels_to_what_is_shown(variant, expected):
     assert [config.pipeline.side_at(level.scale, 252) for level in levels][-1] == 252
 
 
-def test_views_are_as_much_larger_as_strokes_are_finer_up_to_the_photos_size():
-    for stroke_size, side, seen in ((0.5, 1008, 1008), (0.7, 720, 720), (2.0, 504, 252)):
+def test_views_are_as_much_larger_as_strokes_are_finer_up_to_the_photos_size_and_smaller_as_they_are_wider():
+    for stroke_size, side, seen in ((0.5, 1008, 1008), (0.7, 720, 720), (2.0, 252, 252)):
         config = replace(method_config("hier-style").pipeline, stroke_size=stroke_size)
         assert 1008 * config.share_of_photos(1.0, 1008) == pytest.approx(side)
         assert config.side_at(1.0, 1008) == seen
-        assert config.share_of_photos(1.0, 200) == 1.0
+        assert config.share_of_photos(1.0, 200) == 1.0 / max(1.0, stroke_size)
+
+
+@pytest.mark.parametrize(
+    ("photo_side", "settings", "cells"),
+    [
+        (504, {}, 512),
+        (400, {}, 400),
+        (1008, {}, 512),
+        (1008, {"stroke_size": 0.5}, 1008),
+        (1008, {"view_side": "photos"}, 1008),
+        (504, {"stroke_size": 2.0}, 256),
+        (10, {}, 16),
+    ],
+)
+def test_the_hash_grid_is_as_fine_as_the_views(photo_side, settings, cells):
+    config = replace(method_config("hier-style").pipeline, **settings)
+    config.settle_resolution(photo_side)
+    assert config.model.max_resolution == cells
+    config.settle_resolution(photo_side // 2)
+    assert config.model.max_resolution == cells  # settled once
+    paper = method_config("hier-style-paper").pipeline
+    paper.settle_resolution(photo_side)
+    assert paper.model.max_resolution == 512
+
+
+@pytest.mark.parametrize(
+    ("photo_side", "of_run", "of_style", "cells"),
+    [(504, 1.0, 1.0, 512), (504, 1.0, 0.5, 512), (504, 1.0, 2.0, 256), (504, 0.5, 1.0, 512), (1008, 0.5, 1.0, 512)],
+)
+def test_another_style_of_a_run_with_wider_strokes_has_a_coarser_grid(photo_side, of_run, of_style, cells):
+    config = replace(method_config("hier-style").pipeline, stroke_size=of_run)
+    config.settle_resolution(photo_side)
+    assert config.resolution_for(of_style, photo_side) == cells
 
 
 @pytest.mark.parametrize(("view_side", "side"), [("photos", 1008), (300, 300), (504, 504)])

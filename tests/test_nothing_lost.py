@@ -1,7 +1,6 @@
 """What a command saved stays: another one takes a new name, or is told that what is there may be lost."""
 
 import contextlib
-import copy
 import errno
 import json
 import re
@@ -157,7 +156,7 @@ def test_runs_that_begin_in_one_second_have_folders_of_their_own(tmp_path: Path)
 
     names = []
     for _ in range(2):
-        config = copy.deepcopy(method_config("coarse-fewshot"))
+        config = method_config("coarse-fewshot")
         config.output_dir, config.data, config.timestamp = tmp_path, Path("fern"), "{timestamp}"
         config.set_timestamp()
         config.get_base_dir().mkdir(parents=True)

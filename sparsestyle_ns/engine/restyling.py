@@ -69,12 +69,12 @@ class Workshop:
         pipeline = self.pipeline
         return pipeline.targets.backbone if pipeline.targets else pipeline.config.load_backbone(pipeline.device)
 
-    def new_field(self) -> nn.Module:
+    def new_field(self, max_resolution: int) -> nn.Module:
         """A field as it is before training, the same each time."""
         device = torch.device(self.pipeline.device)
         with self.lock, torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
             torch.manual_seed(SEED)
-            return self.pipeline.model.new_style()
+            return self.pipeline.model.new_style(max_resolution)
 
 
 class Restyling:
@@ -98,7 +98,9 @@ class Restyling:
         if self.iterations < 1:
             raise InputError(f"A style needs at least 1 iteration, and {self.iterations} were asked for.")
         self._painting = Path(PAINTING_FOLDER) / safe_file_name(self.image.name, "painting")
-        self.field = workshop.new_field()
+        settings, photo_side = self.pipeline.config, self.pipeline.datamanager.photo_side
+        self.max_resolution = settings.resolution_for(self.own.get("stroke_size", settings.stroke_size), photo_side)
+        self.field = workshop.new_field(self.max_resolution)
         optimizers = over_iterations(self.config.optimizers, self.iterations)
         self.optimizers = FiniteOptimizers(optimizers, {"fields": list(self.field.parameters())})
 
@@ -150,7 +152,8 @@ class Restyling:
             config = copy.deepcopy(self.config)
             config.timestamp, config.max_num_iterations = folder.name, self.iterations
             config.load_dir = config.load_step = config.load_checkpoint = None
-            config.pipeline = replace(config.pipeline, **self.own)
+            model = replace(config.pipeline.model, max_resolution=self.max_resolution)
+            config.pipeline = replace(config.pipeline, **self.own, model=model)
             config.pipeline.style_image, config.pipeline.decided = folder.resolve() / self._painting, self.effects
             write_whole(new / "config.yml", yaml.dump(config))
             if (record := self._record()) is not None:
@@ -175,7 +178,8 @@ class Restyling:
     def notes(self) -> CheckpointNotes:
         """What its checkpoint says beside the state."""
         notes = run_notes(self.effects, self._record())
-        return style_notes(self.pipeline, notes, asdict(self.workshop.backbone.description))
+        notes = style_notes(self.pipeline, notes, asdict(self.workshop.backbone.description))
+        return {**notes, "max_resolution": self.max_resolution}
 
     def _record(self) -> Optional[SceneRecord]:
         """What is known of the scene, with this painting."""

@@ -44,6 +44,7 @@ def style_notes(pipeline: HierStylePipeline, notes: CheckpointNotes, backbone: D
         "coarse_run": str(pipeline.config.coarse_run),
         "coarse_field": asdict(pipeline.config.model.coarse_field),
         "fine_encoding": pipeline.model.config.fine_encoding,
+        "max_resolution": pipeline.model.config.max_resolution,
     }
 
 
@@ -193,11 +194,13 @@ class HierStyleTrainer(SparseStyleTrainer):
 
 
 def _adopt_notes(pipeline: HierStylePipelineConfig, notes: CheckpointNotes) -> None:
-    """Takes from the run that is resumed what was found out when it began: the coarse field, and what auto was."""
+    """Takes from the run that is resumed what was found out when it began: what its settings stood for."""
     # Not from its config.yml: that may be this command's own by now, where training goes on in the same folder.
     pipeline.model.coarse_field = CoarseFieldConfig(**notes["coarse_field"])
     pipeline.coarse_run = Path(notes["coarse_run"])
     if pipeline.model.fine_encoding == "auto":
         pipeline.model.fine_encoding = notes["fine_encoding"]
+    if pipeline.model.max_resolution is None:
+        pipeline.model.max_resolution = notes["max_resolution"]
     if pipeline.backbone == "auto" and pipeline.vgg_weights is None:
         pipeline.backbone = notes["backbone"]["name"]

@@ -2,7 +2,7 @@
 
 import copy
 from dataclasses import dataclass
-from typing import Literal, Tuple, Union
+from typing import Literal, Optional, Tuple, Union
 
 import torch
 from jaxtyping import Float
@@ -63,8 +63,10 @@ class FineFieldConfig:
     """Levels of the hash grid (M)."""
     min_resolution: int = 16
     """Cells along the cube's side on the first level (N_min). The paper's is 128; coarser ones make wider strokes."""
-    max_resolution: int = 512
-    """Cells along the cube's side on the last level (N_max)."""
+    max_resolution: Optional[int] = None
+    """Cells along the cube's side on the last level (N_max). None: about as many as the largest views that are stylised
+    have pixels along their longer side, since cells finer than that learn noise; as many times fewer as strokes are
+    wider than 1."""
     depth_cells: float = 1 / 16
     """Cells along depth as a share of those across, from 0 to 1, where all cameras look one way (NDC). Photos hardly
     say at which depth a surface is: where colour may change along depth as fast as across, strokes become the surfaces'
@@ -107,6 +109,7 @@ class FineFieldConfig:
             return NoEncoding()
         if self.fine_encoding == "frequency":
             return FrequencyEncoding(self.frequency_levels)
+        assert self.max_resolution is not None
         resolutions = self.min_resolution, self.max_resolution
         shape = (self.hash_levels, *resolutions, self.features_per_level, self.log2_table_size)
         return TinyCudaGrid(*shape, device=device) if self.fine_encoding == "tiny-cuda-nn" else HashGrid(*shape)

@@ -105,10 +105,11 @@ class HierStyleModel(SceneModel):
             lambda: [part for part in (self.field, self.space, self.occupancy) if part is not None],
         )
 
-    def new_style(self) -> StylisedField:
-        """A field to be stylised, as it is before training, on the coarse field's device."""
+    def new_style(self, max_resolution: Optional[int] = None) -> StylisedField:
+        """A field to be stylised, as it is before training, on the coarse field's device; its grid as fine as given."""
         effects = self.effects.on("residual_density"), self.effects.on("ndc")
-        new = self.config.new_field(self.field, *effects, self._built_for())
+        config = self.config if max_resolution is None else replace(self.config, max_resolution=max_resolution)
+        new = config.new_field(self.field, *effects, self._built_for())
         return new.to(next(self.field.parameters()).device)
 
     def _built_for(self) -> torch.device:

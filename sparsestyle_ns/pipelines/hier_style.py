@@ -30,6 +30,8 @@ from sparsestyle_ns.utils.progress import say
 
 STROKE_SIZES = (0.5, 2.0)
 """The smallest and the largest."""
+CELL_STEP = 16
+"""Where the hash grid follows the views, its finest level has a multiple of so many cells along a side."""
 
 
 @dataclass
@@ -46,7 +48,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     and its settings, and where there is none it is trained first."""
     view_side: Union[int, Literal["photos"]] = 504
     """Longer side, in pixels, of the views that are stylised, where photos are larger; as many times more as strokes
-    are finer than 1. photos: always theirs. Pictures are of any size all the same."""
+    are finer than 1, and fewer as they are wider. photos: as large as these. Pictures are of any size all the same."""
     view_scales: Tuple[float, ...] = (0.25, 0.5, 1.0)
     """Sizes at which the views are stylised, one after another, as shares of `view_side`; the last is the one that
     counts, and iterations before it are quick."""
@@ -54,7 +56,8 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     """Shares of the iterations at these sizes."""
     stroke_size: Annotated[float, tyro.conf.arg(aliases=("--stroke-size",))] = 1.0
     """How wide strokes are, from 0.5 to 2: the feature network sees views and painting in this many times smaller
-    pictures, where its patches are as many times wider. 0.5 takes about four times the time and memory."""
+    pictures, where its patches are as many times wider, and the field learns nothing that is finer. 0.5 takes about
+    four times the time and memory."""
     feature_side: Optional[int] = None
     """Longer side, in pixels, at which the network sees the largest views where strokes are of size 1. None: that of
     the views."""
@@ -124,7 +127,28 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
 
     def share_of_photos(self, scale: float, photo_side: int) -> float:
         """What views at one of the `view_scales` have of the longer side of their photos, at most 1."""
-        return scale * min(1.0, self._largest_side(photo_side) / min(1.0, self.stroke_size) / photo_side)
+        reduced = min(1.0, self._largest_side(photo_side) / min(1.0, self.stroke_size) / photo_side)
+        return scale * reduced / max(1.0, self.stroke_size)
+
+    def settle_resolution(self, photo_side: int) -> None:
+        """Replaces the model's `max_resolution` by what it stands for beside photos of a size, where it is None."""
+        if self.model.max_resolution is None:
+            side = photo_side * self.share_of_photos(1.0, photo_side)
+            self.model.max_resolution = self._cells(side)
+
+    def resolution_for(self, stroke_size: float, photo_side: int) -> int:
+        """The `max_resolution` of a style with strokes of another size on this run's views, where that is settled.
+
+        It is the run's own, but where strokes are wider at most that of views which are as many times smaller.
+        """
+        assert self.model.max_resolution is not None
+        if stroke_size <= self.stroke_size:
+            return self.model.max_resolution
+        side = min(photo_side, self._largest_side(photo_side)) / stroke_size
+        return min(self.model.max_resolution, self._cells(side))
+
+    def _cells(self, side: float) -> int:
+        return max(self.model.min_resolution, CELL_STEP * math.ceil(side / CELL_STEP))
 
     def side_at(self, scale: float, photo_side: int) -> int:
         """Longer side, in pixels, at which the network sees views at one of the `view_scales`, and the painting."""
@@ -194,6 +218,10 @@ class HierStylePipeline(CheckedPipeline):
     """What this run trains, once it is set up."""
     on_losses: Optional[Callable[[int, Losses], None]] = None
     """Told of each iteration and its losses, by a viewer that shows them."""
+
+    def settle(self) -> None:
+        """Fixes how fine the hash grid is, by the photos' size."""
+        self.config.settle_resolution(self.datamanager.photo_side)
 
     def new_task(
         self,

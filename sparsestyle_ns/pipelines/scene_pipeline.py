@@ -84,6 +84,7 @@ class CheckedPipeline(VanillaPipeline):
         self.datamanager.to(device)
         self.effects = config.decided or decide(self.datamanager.scene, config.effects)
         self.datamanager.set_effects(self.effects)
+        self.settle()
         dataset, ndc = self.datamanager.train_dataset, scene_info(self.datamanager.train_dataparser_outputs).ndc
         self._model = config.model.setup(
             scene_box=dataset.scene_box,
@@ -99,6 +100,9 @@ class CheckedPipeline(VanillaPipeline):
         self.panel = None if config.panel is None else config.panel(self)  # nerfstudio's viewer finds it here
         if test_mode != "val":
             put_ffmpeg_on_path()
+
+    def settle(self) -> None:
+        """Replaces settings of the model that follow from the photos, before it is built."""
 
     def _say_what_is_unused(self) -> None:
         """Names what was asked for, or is in the scene, and has no effect; and sees to it that ns-render can go on."""

@@ -33,6 +33,8 @@ class CheckpointNotes(TypedDict, total=False):
     """Settings of the coarse field in a stylised run."""
     fine_encoding: str
     """What the residual field sees of a position."""
+    max_resolution: int
+    """Cells along a side of the finest level of its hash grid."""
 
 
 def checkpoint_step(path: Path) -> int:

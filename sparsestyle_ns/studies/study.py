@@ -77,7 +77,7 @@ class Study:
         Raises:
             SystemExit: there is no such flag; what is wrong has been printed.
         """
-        config = copy.deepcopy(method_config(self.method(stage)))
+        config = method_config(self.method(stage))
         pipeline, manager = config.pipeline, config.pipeline.datamanager
         manager.data, manager.dataparser = self.data, copy.deepcopy(self.dataparser)
         manager.num_views, manager.view_ids = self.num_views, self.view_ids

@@ -81,7 +81,8 @@ class Workbench:
         self.effects = decide(self.manager.scene, self.coarse_config.pipeline.effects)
         self.manager.set_effects(self.effects)
         settings: HierStylePipelineConfig = self.style_config.pipeline
-        settings.feature_side = settings.feature_side or self.manager.photo_side  # a number, to measure others beside
+        settings.feature_side = settings.feature_side or self.manager.photo_side  # numbers, to measure others beside
+        settings.settle_resolution(self.manager.photo_side)
         self.eval_dataset = self.manager.eval_dataset
         self.views = list(evenly_spaced(len(self.eval_dataset), min(HELD_OUT_VIEWS, len(self.eval_dataset))))
         self.photos = {view: self.eval_dataset[view]["image"][..., :3].to(self.device) for view in self.views}

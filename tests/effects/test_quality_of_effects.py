@@ -1,6 +1,5 @@
 """An effect that a scene calls for makes views better that weren't trained on."""
 
-import copy
 import functools
 import shutil
 from dataclasses import replace
@@ -58,7 +57,7 @@ def painting(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def small_config(method: str, folder: Path, layout: str, steps: int, effects: Dict[str, str]) -> Any:
     """A draft's config with a small coarse field, for all of a scene's training views."""
-    config = copy.deepcopy(method_config(method))
+    config = method_config(method)
     pipeline = config.pipeline
     pipeline.effects = EffectSettings(**effects)
     manager, field = pipeline.datamanager, pipeline.model.coarse_field

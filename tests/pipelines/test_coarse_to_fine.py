@@ -201,5 +201,7 @@ def test_a_restyling_with_settings_of_its_own_leaves_the_other_styles_features_a
     try:
         saved = load_run(folder / "config.yml").config.pipeline
         assert (saved.stroke_size, saved.kept_structure) == (2.0, 0.8)
+        own = pipeline.config.resolution_for(2.0, pipeline.datamanager.photo_side)
+        assert saved.model.max_resolution == own < pipeline.config.model.max_resolution
     finally:
         shutil.rmtree(folder)

@@ -489,7 +489,7 @@ def test_restyling_takes_the_trainers_steps(runs: SimpleNamespace, painting: Pat
         training.step()
 
     workshop = Workshop(pipeline, runs.style, threading.Lock())
-    workshop.new_field = lambda: fresh
+    workshop.new_field = lambda max_resolution: fresh
     frozen = [view.frozen for view in pipeline.scene_views.views]
     restyling = Restyling(workshop, Painting.read(painting), iterations=3)
     steps = list(restyling)
@@ -516,7 +516,7 @@ def test_random_numbers_of_training_go_on_as_if_there_were_no_restyling(panel: S
     torch.manual_seed(1)
     expected = torch.rand(3)
     torch.manual_seed(1)
-    fields = [panel.restyling.workshop.new_field() for _ in range(2)]
+    fields = [panel.restyling.workshop.new_field(64) for _ in range(2)]
     assert torch.equal(torch.rand(3), expected)
     assert all(map(torch.equal, fields[0].parameters(), fields[1].parameters()))
 
