@@ -141,6 +141,7 @@ coarse_fewshot_paper = variant(
         "pipeline.datamanager.train_num_rays_per_batch": 1024,
         "pipeline.effects": EffectSettings(view_color="on", matched_depth="off"),
         "pipeline.model.distortion_weight": 0.0,
+        "pipeline.model.early_iterations": 0.0,
         "optimizers": {"fields": adam(5e-4), "hidden_layers": adam(5e-4), "cameras": adam(5e-4)},
     },
 )

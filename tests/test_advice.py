@@ -464,6 +464,16 @@ TABLE = [
         coarse("--pipeline.model.even-share 0"),
         coarse("--pipeline.model.even-share 1"),
     ),
+    Advice(
+        "--pipeline.model.early-iterations is ",
+        coarse("--pipeline.model.early-iterations 1.5"),
+        coarse("--pipeline.model.early-iterations 1"),
+    ),
+    Advice(
+        "; give 1 sample or more",
+        coarse("--pipeline.model.num-samples 0"),
+        coarse("--pipeline.model.early-samples 1"),
+    ),
     Advice("--pipeline.semantic-weight is ", coarse("--pipeline.semantic-weight -1"), coarse("")),
     Advice(
         "--pipeline.semantic-every is ", coarse("--pipeline.semantic-every 0"), coarse("--pipeline.semantic-every 1")

@@ -122,6 +122,9 @@ def test_views_that_dont_exist_are_named(llff_scene: Path, tmp_path: Path, flags
         (["--max-image-side", "0"], "--max-image-side is 0; give 8 pixels or more"),
         (["--pipeline.datamanager.train-num-rays-per-batch", "0"], "rays-per-batch is 0; give 1 or more"),
         (["--pipeline.model.even-share", "0"], "--pipeline.model.even-share is 0.0; give a number above 0"),
+        (["--pipeline.model.early-iterations", "-1"], "early-iterations is -1.0; give a number from 0 to 1"),
+        (["--pipeline.model.num-samples", "0"], "--pipeline.model.num-samples is 0; give 1 sample or more"),
+        (["--pipeline.model.early-samples", "0"], "--pipeline.model.early-samples is 0; give 1 sample or more"),
         (["--machine.device-type", "cuda", "--machine.num-devices", "99"], "--machine.num-devices 99, but torch finds"),
     ],
 )

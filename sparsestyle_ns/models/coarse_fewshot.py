@@ -42,6 +42,10 @@ class CoarseFewShotModelConfig(SceneModelConfig):
     _target: Type = field(default_factory=lambda: CoarseFewShotModel)
     num_samples: int = 24
     """Samples a ray in training."""
+    early_samples: int = 12
+    """The same in its first iterations, if fewer, where empty space is skipped: a blurred field needs no more."""
+    early_iterations: float = 0.6
+    """Share of all iterations, from 0 to 1, that are these first ones."""
     num_eval_samples: int = 6
     """Samples a ray in pictures of a trained field, where its weight is; while it learns, as many as in training."""
     volume_resolution: int = 128
@@ -87,6 +91,11 @@ class CoarseFewShotModel(SceneModel):
         super().populate_modules()
         if not 0.0 < (share := self.config.even_share) <= 1.0:
             raise InputError(f"--pipeline.model.even-share is {share}; give a number above 0 and up to 1.")
+        if not 0.0 <= (early := self.config.early_iterations) <= 1.0:
+            raise InputError(f"--pipeline.model.early-iterations is {early}; give a number from 0 to 1.")
+        for name in ("num_samples", "early_samples"):
+            if (count := getattr(self.config, name)) < 1:
+                raise InputError(f"--pipeline.model.{name.replace('_', '-')} is {count}; give 1 sample or more.")
         self.field = self.config.coarse_field.setup(self.effects.on("view_color"))
         self.build_grid(self.effects)
         self.step = 0
@@ -136,6 +145,14 @@ class CoarseFewShotModel(SceneModel):
         if self.refinement is not None:
             self.refinement.learns = step >= self.config.refinement_start * self.num_iterations
 
+    @property
+    def samples_now(self) -> int:
+        """Samples a ray at this iteration."""
+        config = self.config
+        if self.grid is None or self.step >= config.early_iterations * self.num_iterations:
+            return config.num_samples
+        return min(config.early_samples, config.num_samples)
+
     def place_samples(self, segments: Segments, num_samples: int, generator: Optional[torch.Generator]) -> Tensor:
         """Borders of samples on rays: where the grid remembers density, or evenly without one."""
         if self.grid is None:
@@ -166,7 +183,7 @@ class CoarseFewShotModel(SceneModel):
     def render_batch(self, segments: Segments, origins: Tensor, directions: Tensor) -> Tuple[DenseRender, Tensor]:
         """Renders the rays of a training step, each process its share; also returns the samples' borders."""
         generator = torch.Generator(device=self.device).manual_seed(self.config.seed * 1_000_003 + self.step)
-        edges = self.place_samples(segments, self.config.num_samples, generator)
+        edges = self.place_samples(segments, self.samples_now, generator)
         thinning = Thinning(self.config.thinning, generator) if self.config.thinning > 0 else None
         if num_processes() == 1:
             return self.render(segments, directions, edges, thinning), edges

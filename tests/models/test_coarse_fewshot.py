@@ -94,6 +94,24 @@ def test_a_step_of_both_optimisers_moves_every_parameter():
     assert len(moved) == len(list(model.field.parameters()))
 
 
+@pytest.mark.parametrize(
+    ("effects", "settings", "expected"),
+    [
+        (("empty_space",), {}, [3, 3, 3, 8, 8]),
+        (("empty_space",), {"early_iterations": 0.0}, 5 * [8]),
+        (("empty_space",), {"early_samples": 9}, 5 * [8]),  # never more than later
+        ((), {}, 5 * [8]),  # without a grid all are even, and few of these would miss what there is
+    ],
+)
+def test_the_first_iterations_have_fewer_samples_a_ray_where_a_grid_places_them(effects, settings, expected):
+    model = make_model(*effects, **{"num_samples": 8, "early_samples": 3, "early_iterations": 0.6, **settings}).train()
+    model.num_iterations, found = 5, []
+    for step in range(5):
+        model.update_to_step(step)
+        found.append(model.get_outputs(rays())["weights"].shape[1])
+    assert found == expected
+
+
 def test_a_trained_fields_picture_of_six_samples_is_nearly_that_of_all_its_steps():
     model = make_model()
     assert model.config.num_eval_samples == 6
