@@ -470,9 +470,7 @@ TABLE = [
         coarse("--pipeline.model.early-iterations 1"),
     ),
     Advice(
-        "; give 1 sample or more",
-        coarse("--pipeline.model.num-samples 0"),
-        coarse("--pipeline.model.early-samples 1"),
+        "; give 1 sample or more", coarse("--pipeline.model.num-samples 0"), coarse("--pipeline.model.early-samples 1")
     ),
     Advice("--pipeline.semantic-weight is ", coarse("--pipeline.semantic-weight -1"), coarse("")),
     Advice(
