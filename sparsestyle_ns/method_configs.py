@@ -71,7 +71,7 @@ def variant(of: MethodSpecification, suffix: str, description: str, settings: Di
 
 coarse_fewshot = method(
     SparseStyleTrainerConfig,
-    "Coarse radiance field from three to eight photos (stage 1): about five minutes on two CPU cores at 504 pixels.",
+    "Coarse radiance field from three to eight photos (stage 1): about four minutes on two CPU cores at 504 pixels.",
     _target=CoarseFewShotTrainer,
     method_name="coarse-fewshot",
     max_num_iterations=COARSE_ITERATIONS,
@@ -91,7 +91,7 @@ def coarse_fewshot_config() -> SparseStyleTrainerConfig:
 
 hier_style = method(
     HierStyleTrainerConfig,
-    "A coarse-fewshot scene in the style of a painting, --style-image FILE (stage 2); both about ten minutes there.",
+    "A coarse-fewshot scene in the style of a painting, --style-image FILE (stage 2); both about eight minutes there.",
     coarse_method=coarse_fewshot_config,
     method_name="hier-style",
     max_num_iterations=200,

@@ -67,7 +67,7 @@ class HierStylePipelineConfig(CheckedPipelineConfig):
     """Weight of each loss, 0 or more; 0 is off. That of the content loss is λ0, which falls (Eq. 6)."""
     object_style: float = 4.0
     """How many times the style loss's weight counts for an object on a background, which keeps its shape by itself."""
-    kept_structure: Annotated[float, tyro.conf.arg(aliases=("--kept-structure",))] = 0.5
+    kept_structure: Annotated[float, tyro.conf.arg(aliases=("--kept-structure",))] = 0.65
     """The SSIM of brightness to its content picture that a view keeps at least, from 0 to 1, however strong the
     painting's patterns are; more keeps more of the scene, and less of the painting."""
     palette_transfer: PaletteTransfer = "transport"

@@ -38,7 +38,7 @@ class Sweep(NamedTuple):
 
 
 SWEEPS = {
-    "ours": Sweep("pipeline.kept_structure", "structure", (0.0, 0.8), strengths=(0.7, 0.4)),
+    "ours": Sweep("pipeline.kept_structure", "structure", (0.0, 0.65, 0.8), strengths=(0.7, 0.4)),
     "arf": Sweep("pipeline.loss_weights.content", "λ", (0.03, 0.3, 3.0)),
 }
 """Of each kind of stage 2."""

@@ -12,7 +12,7 @@ from viser import GuiApi
 
 from sparsestyle_ns.engine.restyling import Progress, Restyling, Workshop
 from sparsestyle_ns.fields.fine import StylisedField
-from sparsestyle_ns.pipelines.hier_style import STROKE_SIZES
+from sparsestyle_ns.pipelines.hier_style import STROKE_SIZES, HierStylePipelineConfig
 from sparsestyle_ns.runs.run_folder import read_config
 from sparsestyle_ns.style.painting import Painting
 from sparsestyle_ns.utils.errors import InputError
@@ -82,7 +82,8 @@ class RestylingControls:
         self.workshop: Optional[Workshop] = None
         self.thread: Optional[threading.Thread] = None
         self._stopping, self._busy, self._pace = threading.Event(), threading.Lock(), Pace()
-        iterations, stroke_size, kept_structure, said = 0, 1.0, 0.5, ""
+        iterations, said = 0, ""
+        stroke_size, kept_structure = HierStylePipelineConfig.stroke_size, HierStylePipelineConfig.kept_structure
         try:
             self.workshop = open_workshop()
             config = read_config(self.workshop.folder)
